@@ -1,0 +1,1 @@
+"""Declarative experiments and datasets: YAML in, validated frozen models out."""

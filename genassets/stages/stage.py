@@ -1,0 +1,132 @@
+"""The contract between a stage and the machine that runs it.
+
+A stage is a declaration: its name and schema version, its config model, the stages whose outputs it
+reads, the packages whose code decides its result, and the function that does the work. The function reads
+files, writes files below ``out`` and returns metrics; it knows nothing of the store, Prefect or MLflow.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One tidy row of a stage's results.
+
+    ``class_name`` is an actor class or "all"; ``method`` names extractor, window, mask rule or baseline;
+    ``n`` counts the samples behind ``value``. The column is called ``class`` in JSON and Parquet.
+    """
+
+    setting: str
+    split: str
+    class_name: str
+    metric: str
+    value: float
+    n: int
+    method: str
+
+    def row(self) -> dict[str, Any]:
+        """The metric with the column names of the metrics table."""
+        return {
+            "setting": self.setting,
+            "split": self.split,
+            "class": self.class_name,
+            "metric": self.metric,
+            "value": float(self.value),
+            "n": int(self.n),
+            "method": self.method,
+        }
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Directories of the finished stages that a stage needs.
+
+    ``objects`` maps stage to shard to directory; a stage that is not sharded has the single shard "".
+    """
+
+    objects: Mapping[str, Mapping[str, Path]]
+
+    def one(self, stage: str) -> Path:
+        """The directory of a stage with one output, or of this shard's own output of a sharded stage.
+
+        Raises:
+            ValueError: the stage has several shards here; use ``shards``.
+        """
+        paths = self._of(stage)
+        if len(paths) != 1:
+            raise ValueError(f"stage {stage!r} has {len(paths)} shards {sorted(paths)}; read them with shards()")
+        return next(iter(paths.values()))
+
+    def shards(self, stage: str) -> dict[str, Path]:
+        """Directory of each shard of a stage, in the order of the dataset."""
+        return dict(self._of(stage))
+
+    def _of(self, stage: str) -> Mapping[str, Path]:
+        if stage not in self.objects:
+            raise KeyError(f"stage {stage!r} is not among the declared needs {sorted(self.objects)}")
+        return self.objects[stage]
+
+
+def _ignore_progress(done: float, total: float, message: str) -> None:
+    """Progress listener of a run that shows none."""
+
+
+def _ignore_curve(name: str, step: int, value: float) -> None:
+    """Curve listener of a run that records none."""
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What a running stage gets besides inputs and config.
+
+    ``work_dir`` belongs to this fingerprint and survives a kill, so checkpoints go there; it is removed
+    after success. ``shard`` is the name of the log, or None for a stage that is not sharded.
+    """
+
+    seed: int
+    shard: str | None
+    work_dir: Path
+    on_progress: Callable[[float, float, str], None] = field(default=_ignore_progress)
+    on_curve: Callable[[str, int, float], None] = field(default=_ignore_curve)
+
+    def progress(self, done: float, total: float, message: str = "") -> None:
+        """Report that ``done`` of ``total`` units of work are finished."""
+        self.on_progress(done, total, message)
+
+    def curve(self, name: str, step: int, value: float) -> None:
+        """Record one point of a curve, such as a loss over steps."""
+        if not math.isfinite(value):
+            raise ValueError(f"curve {name!r} at step {step} is {value}; expected a finite number")
+        self.on_curve(name, int(step), float(value))
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Declaration of a stage.
+
+    Attributes:
+        version: raised when the meaning or format of the output changes without a change of code.
+        needs: stages whose outputs are read. A sharded stage that needs a sharded stage reads its own shard.
+        modules: packages and modules of genassets whose code decides the result, by dotted name
+            ("genassets.masks"); the stage's own module is always included.
+        runtime_only: config fields that change how fast the result comes, never the result.
+        sharded: one output per log of the dataset instead of one over all.
+    """
+
+    name: str
+    version: int
+    config: type[BaseModel]
+    needs: tuple[str, ...]
+    modules: tuple[str, ...]
+    run: Callable[[Inputs, Any, Path, StageContext], list[Metric]]
+    sharded: bool
+    summary: str
+    runtime_only: frozenset[str] = frozenset()
