@@ -1,0 +1,1 @@
+"""The `genassets` command: one file a command, registered in `app`."""

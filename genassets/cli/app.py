@@ -1,0 +1,66 @@
+"""The `genassets` command: registers every command and turns errors into one message and an exit code.
+
+Command files are imported here for their signatures, so they import torch, prefect, mlflow, pandas and such
+inside their functions: importing this module takes less than a quarter of a second (tests/test_doctor.py).
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from typing import Annotated
+
+import typer
+
+from genassets import __version__
+from genassets.errors import GenAssetsError
+
+INTERRUPTED = 130
+
+app = typer.Typer(
+    name="genassets",
+    help="Driving logs to complete 3D actors, a generative prior over them, and augmented training sets.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"genassets {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop."),
+    ] = False,
+    show_traceback: Annotated[
+        bool,
+        typer.Option(
+            "--traceback",
+            envvar="GENASSETS_TRACEBACK",
+            help="With an error, also print where in the code it arose.",
+        ),
+    ] = False,
+) -> None:
+    if show_traceback:
+        os.environ["GENASSETS_TRACEBACK"] = "1"
+
+
+def main() -> None:
+    """Run the `genassets` command and end the process with its exit code."""
+    try:
+        app()
+    except GenAssetsError as error:
+        if os.environ.get("GENASSETS_TRACEBACK", "0") not in ("", "0"):
+            traceback.print_exc()
+        print(f"genassets: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        print("genassets: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
