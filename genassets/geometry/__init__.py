@@ -1,0 +1,1 @@
+"""Rigid transforms, boxes, pinhole cameras and turntable views, in float64 numpy."""
