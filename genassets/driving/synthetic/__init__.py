@@ -1,0 +1,1 @@
+"""A synthetic city in PandaSet format, with the truth beside it."""
