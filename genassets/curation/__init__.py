@@ -1,0 +1,1 @@
+"""From masks to a clean object benchmark: the object table, occlusion, acceptance rules, crops."""
