@@ -59,8 +59,8 @@ def points_in_box(
 def intersect_box(origins: ArrayLike, directions: ArrayLike, size: ArrayLike) -> tuple[Array, Array]:
     """Where rays enter and leave a box, all in the box frame (slab method).
 
-    origins and directions (N, 3); returns (near (N,), far (N,)) in units of the directions' length. Either may be
-    negative (behind the origin). A ray that misses has near > far.
+    origins and directions (N, 3); returns (near (N,), far (N,)) in units of the directions' length. Either
+    may be negative (behind the origin). A ray that misses has near > far.
     """
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     half = np.asarray(size, np.float64) / 2

@@ -89,8 +89,8 @@ def project_box(
 ) -> BoxProjection | None:
     """Project a box that may be partly behind the camera; None where none of it is in front and in the image.
 
-    The twelve edges are clipped at z = `near` (metres) before the division, so a box beside the camera keeps a
-    finite and correct outline.
+    The twelve edges are clipped at z = `near` (metres) before the division, so a box beside the camera keeps
+    a finite and correct outline.
     """
     corners = box_corners(camera_from_box, size)
     visible = clip_edges(corners, near)

@@ -1,7 +1,8 @@
 """Rigid transforms.
 
-A pose `a_from_b` is a (4, 4) matrix that maps coordinates of frame b to frame a. Quaternions are (w, x, y, z).
-Headings are angles of a box's x axis from the world x axis, counter-clockwise seen from above, in radians.
+A pose `a_from_b` is a (4, 4) matrix that maps coordinates of frame b to frame a. Quaternions are (w, x, y,
+z). Headings are angles of a box's x axis from the world x axis, counter-clockwise seen from above, in
+radians.
 """
 
 from __future__ import annotations

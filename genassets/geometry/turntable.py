@@ -17,8 +17,9 @@ def turntable_camera(
 ) -> tuple[Intrinsics, NDArray[np.float64]]:
     """A square camera that looks at a box's centre, and its pose box_from_camera (4, 4).
 
-    Azimuth 0 stands in front of the actor (on +x, looking along -x) and grows counter-clockwise seen from above,
-    so 90 sees the actor's left side. The field of view is 30 degrees and the box's bounding sphere just fits.
+    Azimuth 0 stands in front of the actor (on +x, looking along -x) and grows counter-clockwise seen from
+    above, so 90 sees the actor's left side. The field of view is 30 degrees and the box's bounding sphere
+    just fits.
     """
     radius = float(np.linalg.norm(np.asarray(size, np.float64))) / 2
     half_view = np.radians(FIELD_OF_VIEW_DEGREES) / 2
