@@ -1,8 +1,9 @@
-"""Two trivial predictions that a reconstruction has to beat: the actor's mean colour and its nearest training crop."""
+"""Two trivial predictions that a reconstruction has to beat: the actor's mean colour and its nearest training
+crop.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -15,7 +16,7 @@ Bounds = tuple[float, float, float, float]
 
 @dataclass
 class ColourMean:
-    """Running mean colour over the masked pixels of training crops."""
+    """Running mean colour over the masked pixels of training crops: pixels weigh equally, not crops."""
 
     total: NDArray[np.float64]
     pixels: int
@@ -36,21 +37,14 @@ class ColourMean:
         return (self.total / self.pixels).astype(np.float32)
 
 
-def mean_colour(crops: Iterable[tuple[NDArray, NDArray[np.bool_]]]) -> NDArray[np.float32]:
-    """The mean colour (3,) over the masked pixels of all (crop, mask) pairs: pixels weigh equally, not crops."""
-    mean = ColourMean.empty()
-    for crop, mask in crops:
-        mean.add(crop, mask)
-    return mean.colour()
-
-
 def place_crop(image: NDArray, source: Bounds, target: Bounds, region: tuple[int, int, int, int]) -> NDArray:
     """Resize one image's box bounds into another's.
 
-    The affine map that takes the corners of `source` in `image` (H, W, 3) to the corners of `target` is applied to the
-    image, and the part inside `region` (integer x0, y0, x1, y1 in the target's pixels) is returned, float32 (h, w, 3).
-    Pixels past the image's edge repeat the edge. Shrinking averages: the source is first area-resized by the map's
-    scale, so fine texture does not alias. Raises ValueError for bounds without area.
+    The affine map that takes the corners of `source` in `image` (H, W, 3) to the corners of `target` is
+    applied to the image, and the part inside `region` (integer x0, y0, x1, y1 in the target's pixels) is
+    returned, float32 (h, w, 3). Pixels past the image's edge repeat the edge. Shrinking averages: the source
+    is first area-resized by the map's scale, so fine texture does not alias. Raises ValueError for bounds
+    without area.
     """
     for name, bounds in (("source", source), ("target", target)):
         if bounds[2] <= bounds[0] or bounds[3] <= bounds[1]:
@@ -62,7 +56,8 @@ def place_crop(image: NDArray, source: Bounds, target: Bounds, region: tuple[int
     shrunk_height = max(1, round(height * min(scale_y, 1.0)))
     if (shrunk_width, shrunk_height) != (width, height):
         image = cv2.resize(image, (shrunk_width, shrunk_height), interpolation=cv2.INTER_AREA)
-    # From target pixel centres to source pixel centres; warpAffine counts from pixel centres, hence the halves.
+    # From target pixel centres to source pixel centres; warpAffine counts from pixel centres, hence the
+    # halves.
     to_x, to_y = shrunk_width / width, shrunk_height / height
     slope_x, slope_y = to_x / scale_x, to_y / scale_y
     offset_x = (region[0] + 0.5 - target[0]) * slope_x + source[0] * to_x - 0.5

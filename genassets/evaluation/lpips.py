@@ -1,8 +1,9 @@
 """Learned perceptual image patch similarity (Zhang et al. 2018), version 0.1, in plain torch.
 
-Features of five layers are normalised to unit length over channels, their squared differences weighted by the learned
-linear heads, averaged over pixels and summed over layers. The arrays come from the pinned files of `weights.py`;
-the networks are torchvision's AlexNet and VGG16 feature stacks, which the published heads were fitted to.
+Features of five layers are normalised to unit length over channels, their squared differences weighted by the
+learned linear heads, averaged over pixels and summed over layers. The arrays come from the pinned files of
+`weights.py`; the networks are torchvision's AlexNet and VGG16 feature stacks, which the published heads were
+fitted to.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ INPUT_SCALE = (0.458, 0.448, 0.450)
 """Images in [-1, 1] become ImageNet-normalised: lpips 0.1, `ScalingLayer`."""
 
 MINIMUM_SIDE = 64
-"""Smaller crops leave no pixel in the deepest layers; they are enlarged to this side before they are compared."""
+"""Smaller crops leave no pixel in the deepest layers; they are enlarged to this side before they are
+compared.
+"""
 
 
 def masked_lpips_method(backbone: Backbone) -> str:
@@ -52,8 +55,9 @@ class _Convolution(nn.Module):
 
 
 class Lpips(nn.Module):
-    """The distance network. `arrays` is the nested mapping of the pinned file, `<net>/Conv_i/{kernel,bias}` and
-    `NetLinLayer_i/Conv_0/kernel`; a missing entry is a KeyError that names it."""
+    """The distance network. `arrays` is the nested mapping of the pinned file, `<net>/Conv_i/{kernel,bias}`
+    and `NetLinLayer_i/Conv_0/kernel`; a missing entry is a KeyError that names it.
+    """
 
     shift: Tensor
     scale: Tensor
@@ -61,7 +65,12 @@ class Lpips(nn.Module):
     def __init__(self, arrays: Mapping[str, Any], backbone: Backbone = "alexnet"):
         super().__init__()
         if backbone == "alexnet":
-            network, strides, pools, taps = arrays["AlexNet_0"], (4, 1, 1, 1, 1), {1: (3, 2), 2: (3, 2)}, range(5)
+            network, strides, pools, taps = (
+                arrays["AlexNet_0"],
+                (4, 1, 1, 1, 1),
+                {1: (3, 2), 2: (3, 2)},
+                range(5),
+            )
         else:
             network, strides = arrays["VGG16_0"], (1,) * 13
             pools, taps = dict.fromkeys((2, 4, 7, 10), (2, 2)), (1, 3, 6, 9, 12)
@@ -93,7 +102,9 @@ class Lpips(nn.Module):
         return kept
 
     def distance(self, first: list[Tensor], second: list[Tensor]) -> Tensor:
-        """Distances (n,) between two lists of features; a batch of one is compared with every image of the other."""
+        """Distances (n,) between two lists of features; a batch of one is compared with every image of the
+        other.
+        """
         total = torch.zeros(())
         for index, (a, b) in enumerate(zip(first, second, strict=True)):
             head = getattr(self, f"head_{index}").view(1, -1, 1, 1)
@@ -111,8 +122,9 @@ def masked_distances(
 ) -> list[float]:
     """LPIPS of each prediction to the truth inside the mask.
 
-    All crops (h, w, 3) in [0, 1] are composited on black outside the mask (h, w) and, where the shorter side has fewer
-    than `MINIMUM_SIDE` pixels, enlarged together (bilinear). The truth passes through the network once.
+    All crops (h, w, 3) in [0, 1] are composited on black outside the mask (h, w) and, where the shorter side
+    has fewer than `MINIMUM_SIDE` pixels, enlarged together (bilinear). The truth passes through the network
+    once.
     """
     crops = np.stack([truth, *predictions]).astype(np.float32) * mask[None, ..., None]
     images = torch.from_numpy(np.ascontiguousarray(crops.transpose(0, 3, 1, 2)))

@@ -53,7 +53,9 @@ class ImageScale:
 
 
 def comparison_region(bounds: Bounds, width: int, height: int, padding: int = 2) -> tuple[int, int, int, int]:
-    """Integer bounds around a box, padded, at least `MINIMUM_REGION` a side, moved and cut to stay in the image."""
+    """Integer bounds around a box, padded, at least `MINIMUM_REGION` a side, moved and cut to stay in the
+    image.
+    """
     x0, x1 = _interval(bounds[0] - padding, bounds[2] + padding, width)
     y0, y1 = _interval(bounds[1] - padding, bounds[3] + padding, height)
     return x0, y0, x1, y1

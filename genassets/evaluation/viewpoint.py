@@ -24,7 +24,9 @@ class Viewpoint:
 
     @property
     def azimuth(self) -> float:
-        """Degrees in (-180, 180], counter-clockwise from above: 0 in front of the actor, 90 on its left, 180 behind."""
+        """Degrees in (-180, 180], counter-clockwise from above: 0 in front of the actor, 90 on its left, 180
+        behind.
+        """
         return float(np.degrees(np.arctan2(self.position[1], self.position[0])))
 
 
@@ -38,8 +40,9 @@ class ViewThresholds:
 
 @dataclass(frozen=True)
 class ViewDifference:
-    """What separates two views of one actor: the angle between the directions from the actor to the cameras, and the
-    change of distance between actor and camera."""
+    """What separates two views of one actor: the angle between the directions from the actor to the cameras,
+    and the change of distance between actor and camera.
+    """
 
     angle_degrees: float
     distance_metres: float
@@ -58,8 +61,9 @@ def viewpoint_of(world_from_camera: NDArray, world_from_box: NDArray) -> Viewpoi
 
 
 def view_difference(first: Viewpoint, second: Viewpoint) -> ViewDifference:
-    """The angle in degrees and the distance change in metres between two views. Raises ValueError for a camera at the
-    box's centre, whose direction is undefined."""
+    """The angle in degrees and the distance change in metres between two views. Raises ValueError for a
+    camera at the box's centre, whose direction is undefined.
+    """
     a, b = np.asarray(first.position), np.asarray(second.position)
     if first.distance == 0.0 or second.distance == 0.0:
         raise ValueError("a camera at the centre of the actor's box has no view direction: check the poses")
@@ -73,8 +77,8 @@ def nearest_view(
 ) -> tuple[int, ViewDifference]:
     """Index and difference of the candidate that is nearest in units of the thresholds (the first of equals).
 
-    Because nearness is the larger of the two ratios, the nearest candidate lies within both thresholds whenever any
-    candidate does. Raises ValueError without candidates.
+    Because nearness is the larger of the two ratios, the nearest candidate lies within both thresholds
+    whenever any candidate does. Raises ValueError without candidates.
     """
     if not candidates:
         raise ValueError("no training view to compare with: report such an actor as unseen")

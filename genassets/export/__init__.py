@@ -1,0 +1,1 @@
+"""Actors as people take them away: meshes, turntables and pictures."""
