@@ -59,7 +59,7 @@ def draw_overlay(image: Image, rows: Sequence[Any]) -> Image:
         if row.mask_rle is None:
             continue
         mask = mask_of(row)
-        hue = np.uint8([[[index * 47 % 180, 220, 255]]])
+        hue = np.array([[[index * 47 % 180, 220, 255]]], np.uint8)
         colour = cv2.cvtColor(hue, cv2.COLOR_HSV2RGB)[0, 0]
         canvas[mask] = (0.55 * canvas[mask] + 0.45 * colour).astype(np.uint8)
         contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

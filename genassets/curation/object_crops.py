@@ -74,7 +74,7 @@ def cut_object(
     side = region[2] - region[0]
     method = cv2.INTER_AREA if side > resolution else cv2.INTER_LINEAR
     size = (resolution, resolution)
-    pixels = cv2.resize(cut_region(image, region), size, interpolation=method)
+    pixels = np.asarray(cv2.resize(cut_region(image, region), size, interpolation=method), np.uint8)
     coverage = cv2.resize(cut_region(mask.astype(np.float32), region), size, interpolation=method)
     camera = intrinsics.cropped(*region).resized(resolution, resolution)
     return ObjectCrop(pixels, coverage > 0.5, camera, resolution / side)

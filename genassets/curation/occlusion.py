@@ -11,13 +11,13 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 Outline = Literal["hull", "bounds"]
 
 
-def occluded_fractions(outlines: Sequence[Array], depths: Sequence[float], cells: int = 96) -> Array:
+def occluded_fractions(outlines: Sequence[Array], depths: ArrayLike, cells: int = 96) -> Array:
     """Fraction in [0, 1] of each outline's area that lies under the union of the nearer outlines.
 
     outlines: N convex polygons (K, 2) in pixels, in order around, of one image. depths: their distances; of
@@ -25,11 +25,11 @@ def occluded_fractions(outlines: Sequence[Array], depths: Sequence[float], cells
     outline. A cell belongs to an outline when its centre does, so the error is about one cell's share of
     the perimeter.
     """
-    depths = np.asarray(depths, dtype=np.float64)
+    distance = np.asarray(depths, dtype=np.float64)
     bounds = np.array([outline_bounds(outline) for outline in outlines]).reshape(-1, 4)
     result = np.zeros(len(outlines))
     for index, outline in enumerate(outlines):
-        nearer = depths < depths[index]
+        nearer = distance < distance[index]
         touching = (
             (bounds[:, 0] < bounds[index, 2])
             & (bounds[:, 2] > bounds[index, 0])
@@ -44,25 +44,25 @@ def occluded_fractions(outlines: Sequence[Array], depths: Sequence[float], cells
         if len(centres) == 0:
             continue
         covered = np.zeros(len(centres), dtype=bool)
-        for other in occluders:
+        for other in occluders.tolist():
             covered |= inside_convex(outlines[other], centres)
         result[index] = covered.mean()
     return result
 
 
-def nearer_box_ious(bounds: Array, depths: Sequence[float]) -> Array:
+def nearer_box_ious(bounds: ArrayLike, depths: ArrayLike) -> Array:
     """Largest IoU of each rectangle (N, 4) with a nearer rectangle; 0 where none is nearer.
 
     DiscoScene's rule (Xu et al. 2023), which the paper's SSDNeRF baseline uses: drop above 0.5.
     """
-    bounds, depths = np.asarray(bounds, np.float64).reshape(-1, 4), np.asarray(depths, np.float64)
-    low = np.maximum(bounds[:, None, :2], bounds[None, :, :2])
-    high = np.minimum(bounds[:, None, 2:], bounds[None, :, 2:])
+    boxes, distance = np.asarray(bounds, np.float64).reshape(-1, 4), np.asarray(depths, np.float64)
+    low = np.maximum(boxes[:, None, :2], boxes[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], boxes[None, :, 2:])
     overlap = np.prod(np.clip(high - low, 0.0, None), axis=-1)
-    area = np.prod(bounds[:, 2:] - bounds[:, :2], axis=-1)
+    area = np.prod(boxes[:, 2:] - boxes[:, :2], axis=-1)
     union = area[:, None] + area[None, :] - overlap
     iou = np.where(union > 0, overlap / np.where(union > 0, union, 1.0), 0.0)
-    nearer = depths[None, :] < depths[:, None]
+    nearer = distance[None, :] < distance[:, None]
     return np.where(nearer, iou, 0.0).max(axis=1, initial=0.0)
 
 

@@ -76,7 +76,7 @@ class GrabCutSegmenter:
             cv2.grabCut(
                 np.ascontiguousarray(small[..., ::-1]),
                 seeds,
-                None,
+                (0, 0, 0, 0),  # the rectangle is not looked at: the labels say where
                 np.zeros((1, 65)),
                 np.zeros((1, 65)),
                 settings.iterations,

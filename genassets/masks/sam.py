@@ -126,13 +126,14 @@ class SamSegmenter:
         step = scale / stride
         shift = (0.5 * scale + offset) / stride - 0.5
         transform = np.array([[step, 0.0, shift[0]], [0.0, step, shift[1]]])
-        return cv2.warpAffine(
+        logits = cv2.warpAffine(
             low,
             transform,
             (x1 - x0, y1 - y0),
             flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
             borderMode=cv2.BORDER_REPLICATE,
         )
+        return np.asarray(logits, dtype=np.float32)
 
 
 def _open_model(path: Path, threads: int) -> Any:
