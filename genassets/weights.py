@@ -271,7 +271,7 @@ def _check_arrays(tree: object, source: Path) -> None:
 def _digest(file: Path, rehash: bool) -> str | None:
     try:
         stat = file.stat()
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     # ctime changes with every write and cannot be set back, unlike mtime.
     identity = [stat.st_size, stat.st_ino, stat.st_mtime_ns, stat.st_ctime_ns]

@@ -1,0 +1,101 @@
+"""The script that sets everything up: what it hands on, and when it sets up again."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="run is a POSIX shell script")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A checkout, a space in its path, whose environment is a stand-in that says how it is called."""
+    root = tmp_path / "my checkout"
+    (root / ".venv" / "bin").mkdir(parents=True)
+    for name in ("run", "pyproject.toml", "constraints.txt"):
+        shutil.copy(REPOSITORY / name, root)
+    for name in ("genassets", "python"):
+        program = root / ".venv" / "bin" / name
+        program.write_text(f'#!/bin/sh\necho "{name} $*"\n')
+        program.chmod(0o755)
+    # What `run` writes when it has set everything up: it must then leave the environment alone.
+    stamp = subprocess.run(
+        ["sh", "-c", '{ echo "$0 cpu"; cat pyproject.toml constraints.txt run; } | cksum', str(root)],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (root / ".venv" / ".set-up").write_text(stamp.stdout)
+    return root
+
+
+def call(checkout: Path, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("GENASSETS_")}
+    return subprocess.run(
+        [str(checkout / "run"), *arguments],
+        cwd=checkout.parent,
+        env=kept | environment,
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_help_needs_no_environment(checkout: Path) -> None:
+    shutil.rmtree(checkout / ".venv")
+    for arguments in ((), ("help",), ("--help",)):
+        finished = call(checkout, *arguments)
+        assert finished.returncode == 0
+        assert "./run demo" in finished.stdout
+    assert not (checkout / ".venv").exists()
+
+
+def test_commands_are_handed_on_with_their_arguments(checkout: Path) -> None:
+    assert call(checkout, "inspect", "a log").stdout == "genassets inspect a log\n"
+    assert call(checkout, "bench", "--json").stdout == "genassets bench --json\n"
+    demo = call(checkout, "demo", "--set", "seed=1").stdout.splitlines()
+    assert demo == ["genassets weights fetch --quiet", "genassets run demo --set seed=1"]
+
+
+def test_test_checks_style_and_types_before_it_runs_the_tests(checkout: Path) -> None:
+    lines = call(checkout, "test", "tests/test_weights.py").stdout.splitlines()
+    tools = [line.split()[2] for line in lines if line.startswith("python -m")]
+    assert tools == ["ruff", "ruff", "mypy", "pytest"]
+    assert lines[-1].endswith("-m not slow tests/test_weights.py")
+    assert "not slow" not in call(checkout, "test", "--all").stdout
+
+
+def test_a_failing_check_fails_the_command(checkout: Path) -> None:
+    python = checkout / ".venv" / "bin" / "python"
+    python.write_text('#!/bin/sh\n[ "$2" != mypy ]\n')
+    assert call(checkout, "test").returncode != 0
+
+
+def test_a_changed_requirement_sets_up_again(checkout: Path) -> None:
+    with (checkout / "constraints.txt").open("a") as file:
+        file.write("# another line\n")
+    finished = call(checkout, "--version", GENASSETS_PYTHON="no-such-python")
+    assert finished.returncode == 6
+    assert "setting up" in finished.stderr
+    assert "needs Python 3.11" in finished.stderr
+    assert not (checkout / ".venv" / ".set-up").exists()
+
+
+def test_another_build_of_torch_sets_up_again(checkout: Path) -> None:
+    finished = call(checkout, "--version", GENASSETS_TORCH="cuda", GENASSETS_PYTHON="no-such-python")
+    assert "setting up" in finished.stderr
+
+
+def test_a_shell_finds_the_environment(checkout: Path) -> None:
+    finished = call(checkout, "shell", "-c", "command -v genassets; echo $VIRTUAL_ENV", SHELL="/bin/sh")
+    assert finished.stdout.splitlines() == [
+        str(checkout / ".venv" / "bin" / "genassets"),
+        str(checkout / ".venv"),
+    ]
