@@ -47,8 +47,8 @@ RIG = {
     "back_camera": (180.0, -0.100),
 }
 LIDAR_HEIGHT = 1.8
-RIGHT_FORWARD_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # of a car that looks
-along +x OPENCV_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+RIGHT_FORWARD_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a car looking along +x
+OPENCV_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def moving_car_x(time: float) -> float:
@@ -67,7 +67,7 @@ def build_tiny_log(
     time_of_day: str | None = None,
     seed: int = 0,
 ) -> Path:
-    """Write the sequence to `path` and return it; the moving car's boxes are where the spinning LiDAR saw it."""
+    """Write the sequence to `path`, return it; the moving car's boxes are where the spinning LiDAR saw it."""
     generator = np.random.default_rng(seed)
     times = START + FRAME_SECONDS * np.arange(frames)
     lidar = make_pose(

@@ -55,7 +55,8 @@ def read_cuboids(path: Path, frame: int) -> tuple[list[Cuboid], Counter[str]]:
     for column in _REQUIRED:
         if column not in table.columns:
             raise LogError(
-                f"{path}: column '{column}' is missing; cuboids need {', '.join(_REQUIRED)}. Download the file again."
+                f"{path}: column '{column}' is missing; cuboids need "
+                f"{', '.join(_REQUIRED)}. Download the file again."
             )
     numbers: dict[str, NDArray[np.float64]] = {}
     for column in _NUMBERS:

@@ -40,7 +40,7 @@ class CameraStream:
     image_paths: tuple[Path | None, ...]
 
     def image(self, frame: int) -> NDArray[np.uint8]:
-        """The frame's image (H, W, 3), RGB; raises LogError where it is missing, truncated or of another size."""
+        """The frame's RGB image (H, W, 3); LogError where it is missing, truncated or of another size."""
         path = self.image_paths[frame]
         if path is None:
             raise LogError(

@@ -159,7 +159,7 @@ def _frame_files(
             if int(stem) >= frame_count:
                 raise LogError(
                     f"{path}: frame {int(stem)} of a log whose timestamps.json has {frame_count} frames; "
-                    f"expected files numbered 0 to {frame_count - 1}. Complete the json files or remove the file."
+                    f"expected files numbered 0 to {frame_count - 1}. Complete the json files or remove it."
                 )
             files[int(stem)] = path
     place = f"{folder.parent.name}/{folder.name}" if folder.name != "lidar" else "lidar"
@@ -187,10 +187,11 @@ def _check_forward(root: Path, camera: CameraStream, world_from_ego: NDArray[np.
     worst = int(np.argmin(cosines))
     if cosines[worst] <= FORWARD_COSINE:
         raise LogError(
-            f"{root}: frame {worst}: the front camera's optical axis has a component of {cosines[worst]:.3f} along "
-            f"the car's forward axis, expected above {FORWARD_COSINE}: lidar/poses.json (x right, y forward, z up) "
-            "and camera/front_camera/poses.json (x right, y down, z forward) do not belong together. Take both from "
-            "the sequence, not from the published static calibration, whose LiDAR frame is turned by 180 degrees."
+            f"{root}: frame {worst}: the front camera's optical axis has a component of {cosines[worst]:.3f} "
+            f"along the car's forward axis, expected above {FORWARD_COSINE}: lidar/poses.json (x right, "
+            "y forward, z up) and camera/front_camera/poses.json (x right, y down, z forward) do not belong "
+            "together. Take both from the sequence, not from the published static calibration, whose LiDAR "
+            "frame is turned by 180 degrees."
         )
 
 
@@ -219,7 +220,7 @@ def _read_tracks(
 
 
 def _time_of_day(root: Path) -> str:
-    """From meta/genassets.json where there is one (synthetic logs), else by PandaSet's list of night sequences."""
+    """From meta/genassets.json where there is one (synthetic logs), else PandaSet's list of nights."""
     path = root / "meta" / "genassets.json"
     if path.is_file():
         content = _read_json(path)

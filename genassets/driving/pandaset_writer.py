@@ -60,7 +60,10 @@ class WrittenCuboid:
 
 @dataclass(frozen=True)
 class WrittenSweep:
-    """A sweep to write: points (N, 3) world metres, intensity (N,) 0..255, times (N,) unix seconds, sensor (N,)."""
+    """A sweep to write.
+
+    points (N, 3) world metres; intensity (N,) 0..255; times (N,) unix seconds; sensor (N,) 0 or 1.
+    """
 
     points: NDArray[np.float64]
     intensity: NDArray[np.floating[Any]]
@@ -127,7 +130,7 @@ class PandasetWriter:
             raise
 
     def add_image(self, camera: str, frame: int, image: NDArray[np.uint8] | bytes) -> None:
-        """Write a camera's image: (H, W, 3) uint8 RGB, encoded as JPEG, or the bytes of a JPEG as they are."""
+        """Write a camera's image: (H, W, 3) uint8 RGB, to be encoded, or the bytes of a JPEG as they are."""
         if camera not in self._cameras:
             raise ValueError(f"camera {camera!r} was not announced; there are {', '.join(self._cameras)}")
         own = self._cameras[camera].intrinsics
@@ -147,7 +150,7 @@ class PandasetWriter:
         times: NDArray[np.float64],
         sensor: NDArray[np.integer[Any]],
     ) -> None:
-        """Write both LiDARs' points: (N, 3) world metres, (N,) 0..255, (N,) unix seconds in float64, (N,) 0 or 1."""
+        """Write both LiDARs' points; shapes and units as in WrittenSweep, times in float64."""
         if times.dtype != np.float64:
             raise ValueError(
                 f"sweep times are {times.dtype}; float32 resolves 128 s at unix times, use float64"
@@ -206,7 +209,7 @@ class PandasetWriter:
         )
 
     def finish(self) -> Path:
-        """Put the sequence in its place and return that; called at the end of a `with` block without error."""
+        """Put the sequence in its place and return that; a `with` block without error ends with it."""
         try:
             for frame in sorted(set(range(self.frame_count)) - self._with_cuboids):
                 self.add_cuboids(frame, [])
@@ -256,8 +259,8 @@ class PandasetWriter:
     @staticmethod
     def _disk_problem(path: Path, error: OSError) -> EnvironmentProblem:
         return EnvironmentProblem(
-            f"{path}: cannot be written ({error.strerror or error}); nothing of the sequence was left behind. "
-            "Free space or choose another place, then start again."
+            f"{path}: cannot be written ({error.strerror or error}); nothing of the sequence was left "
+            "behind. Free space or choose another place, then start again."
         )
 
 

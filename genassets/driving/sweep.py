@@ -57,8 +57,8 @@ def read_sweep(path: Path, start_time: float, world_from_lidar: NDArray[np.float
         bad = np.flatnonzero(~np.isfinite(numbers[column]))
         if len(bad):
             raise LogError(
-                f"{path}: column '{column}', row {bad[0]} is not finite ({len(bad)} such rows); expected numbers. "
-                "Download the file again or leave it out (missing sweeps are skipped)."
+                f"{path}: column '{column}', row {bad[0]} is not finite ({len(bad)} such rows); expected "
+                "numbers. Download the file again or leave it out (missing sweeps are skipped)."
             )
     points = np.stack([numbers["x"], numbers["y"], numbers["z"]], axis=1)
     in_lidar = transform_points(invert_pose(world_from_lidar), points)

@@ -94,14 +94,14 @@ def read_table(path: Path) -> pandas.DataFrame:
         table = TableUnpickler(io.BytesIO(content)).load()
     except ForbiddenGlobal as error:
         raise LogError(
-            f"{path}: the pickle names '{error}', which a table of numbers and text has no use for, so it was not "
-            "loaded: it may run foreign code. Expected a pickled pandas DataFrame. Take the file from a source that "
-            "you trust."
+            f"{path}: the pickle names '{error}', which a table of numbers and text has no use for, so it "
+            "was not loaded: it may run foreign code. Expected a pickled pandas DataFrame. Take the file "
+            "from a source that you trust."
         ) from error
     except Exception as error:  # a corrupt pickle can raise anything at all
         raise LogError(
-            f"{path}: the pickle is corrupt ({type(error).__name__}: {error}); expected a pickled pandas DataFrame. "
-            f"{advice}"
+            f"{path}: the pickle is corrupt ({type(error).__name__}: {error}); expected a pickled pandas "
+            f"DataFrame. {advice}"
         ) from error
     if not isinstance(table, pandas.DataFrame):
         raise LogError(

@@ -118,7 +118,7 @@ def project_box(
 
 
 def clip_edges(corners: Array, near: float) -> Array | None:
-    """Corners (K, 3) of the part of a box with z >= near, from its corners (8, 3); None where nothing is left."""
+    """Corners (K, 3) of the part with z >= near of a box with corners (8, 3); None where nothing is left."""
     in_front = corners[:, 2] >= near
     if not in_front.any():
         return None
@@ -152,7 +152,7 @@ def convex_hull(points: Array) -> Array:
 
 
 def clip_polygon_to_rectangle(polygon: Array, x0: float, y0: float, x1: float, y1: float) -> Array:
-    """The part (M, 2) of a convex polygon (K, 2) inside a rectangle (Sutherland and Hodgman 1974); M may be 0."""
+    """The part (M, 2) of a convex polygon (K, 2) in a rectangle (Sutherland and Hodgman 1974); M may be 0."""
     for axis, limit, sign in ((0, x0, 1.0), (0, x1, -1.0), (1, y0, 1.0), (1, y1, -1.0)):
         if len(polygon) == 0:
             break
