@@ -69,7 +69,7 @@ def build_tiny_log(
 ) -> Path:
     """Write the sequence to `path`, return it; the moving car's boxes are where the spinning LiDAR saw it."""
     generator = np.random.default_rng(seed)
-    times = START + FRAME_SECONDS * np.arange(frames)
+    times: NDArray[np.float64] = START + FRAME_SECONDS * np.arange(frames, dtype=np.float64)
     lidar = make_pose(
         RIGHT_FORWARD_UP,
         np.stack([EGO_SPEED * (times - START), np.zeros(frames), np.full(frames, LIDAR_HEIGHT)], axis=1),

@@ -180,7 +180,7 @@ class PandasetWriter:
             {
                 "uuid": [row.uuid for row in rows],
                 "label": [row.label for row in rows],
-                "yaw": numbers(wrap_angle(row.heading - np.pi / 2) for row in rows),
+                "yaw": numbers(float(wrap_angle(row.heading - np.pi / 2)) for row in rows),
                 "stationary": np.array([row.stationary for row in rows], dtype=bool),
                 "camera_used": np.array([row.camera_used for row in rows], dtype=np.int64),
                 "position.x": numbers(row.centre[0] for row in rows),
