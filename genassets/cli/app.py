@@ -15,7 +15,16 @@ import typer
 
 from genassets import __version__
 from genassets.cli import weights
+from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
+from genassets.cli.explain import explain
+from genassets.cli.list import list_runs
+from genassets.cli.plan import plan
+from genassets.cli.resume import resume
+from genassets.cli.run import run
+from genassets.cli.schema import schema
+from genassets.cli.status import status
+from genassets.cli.verify import verify
 from genassets.errors import GenAssetsError
 
 app = typer.Typer(
@@ -52,6 +61,15 @@ def _options(
         os.environ["GENASSETS_TRACEBACK"] = "1"
 
 
+app.command("run")(run)
+app.command("plan")(plan)
+app.command("status")(status)
+app.command("explain")(explain)
+app.command("resume")(resume)
+app.command("list")(list_runs)
+app.command("verify")(verify)
+app.command("schema")(schema)
+app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.add_typer(weights.app, name="weights")
 

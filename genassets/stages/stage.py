@@ -62,7 +62,9 @@ class Inputs:
         """
         paths = self._of(stage)
         if len(paths) != 1:
-            raise ValueError(f"stage {stage!r} has {len(paths)} shards {sorted(paths)}; read them with shards()")
+            raise ValueError(
+                f"stage {stage!r} has {len(paths)} shards {sorted(paths)}; read them with shards()"
+            )
         return next(iter(paths.values()))
 
     def shards(self, stage: str) -> dict[str, Path]:
@@ -118,6 +120,8 @@ class Stage:
         modules: packages and modules of genassets whose code decides the result, by dotted name
             ("genassets.masks"); the stage's own module is always included.
         runtime_only: config fields that change how fast the result comes, never the result.
+        location_files: outputs that say where data lie, not what they are; when only these change, the
+            stages that read this one don't run again.
         sharded: one output per log of the dataset instead of one over all.
     """
 
@@ -130,3 +134,4 @@ class Stage:
     sharded: bool
     summary: str
     runtime_only: frozenset[str] = frozenset()
+    location_files: frozenset[str] = frozenset()

@@ -1,0 +1,49 @@
+"""One Prefect task for each stage or shard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from prefect import task
+from prefect.cache_policies import NO_CACHE
+
+from genassets.errors import GenAssetsError
+from genassets.pipeline.executor import Outcome
+
+# A missing or forbidden file does not come back by trying again; a stale mount or a busy disk does.
+PERMANENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
+
+
+def worth_retrying(task_definition: Any, task_run: Any, state: Any) -> bool:
+    """Whether a failed step may work on the next try: input/output errors and time-outs, not wrong values."""
+    error = state.result(raise_on_failure=False)
+    if isinstance(error, (GenAssetsError, *PERMANENT)):
+        return False
+    return isinstance(error, OSError | TimeoutError)
+
+
+def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]) -> Outcome:
+    """Engine that makes a Prefect task run of a step.
+
+    The task's parameters are the fingerprints of the inputs and its result is the output's: never arrays.
+    Prefect's cache is off; the store knows better whether a result is still good.
+    """
+    outcomes: list[Outcome] = []
+
+    def step(inputs: dict[str, str]) -> str:
+        outcomes.append(work())
+        return outcomes[-1].stored.fingerprint
+
+    run = task(
+        step,
+        name=key.partition("[")[0],
+        task_run_name=key,
+        cache_policy=NO_CACHE,
+        persist_result=False,
+        retries=2,
+        retry_delay_seconds=[2, 10],
+        retry_condition_fn=worth_retrying,
+    )
+    run(inputs=dict(inputs))
+    return outcomes[-1]

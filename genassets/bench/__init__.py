@@ -1,0 +1,1 @@
+"""Benchmarks: measured figures with their date, machine and command."""

@@ -1,0 +1,27 @@
+"""What a benchmark is, and the list of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+Row = Mapping[str, str | int | float]
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A measurement with a name; ``run`` returns rows that have the same columns.
+
+    ``run`` gets a function that says what is being measured.
+    """
+
+    name: str
+    summary: str
+    run: Callable[[Callable[[str], None]], Sequence[Row]]
+
+
+def benchmarks() -> tuple[Benchmark, ...]:
+    """Every benchmark, in the order of the table. Modules import heavy libraries inside ``run``."""
+    from genassets.bench import pipeline_overhead
+
+    return (pipeline_overhead.BENCHMARK,)

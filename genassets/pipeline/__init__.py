@@ -1,0 +1,1 @@
+"""The machine: fingerprints, store, plan and executor. It knows stages by name and contract only."""

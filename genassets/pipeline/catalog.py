@@ -1,0 +1,42 @@
+"""The stages there are, in an order in which each comes after what it needs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from pydantic import BaseModel
+
+from genassets.stages import ingest
+from genassets.stages.stage import Stage
+
+CATALOG: tuple[Stage, ...] = (ingest.STAGE,)
+
+
+def configs(catalog: Iterable[Stage]) -> dict[str, type[BaseModel]]:
+    """Config model of each stage, by name."""
+    return {stage.name: stage.config for stage in catalog}
+
+
+def wanted_stages(catalog: Iterable[Stage], names: Iterable[str] | None) -> tuple[Stage, ...]:
+    """The named stages and all that they need, in the catalog's order; all for None."""
+    ordered = tuple(catalog)
+    by_name: Mapping[str, Stage] = {stage.name: stage for stage in ordered}
+    if names is None:
+        return ordered
+    wanted: set[str] = set()
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop()
+        if name not in wanted:
+            wanted.add(name)
+            waiting.extend(by_name[name].needs)
+    return tuple(stage for stage in ordered if stage.name in wanted)
+
+
+def dependents(stages: Iterable[Stage], name: str) -> set[str]:
+    """A stage and all that hang on it, directly or not."""
+    found = {name}
+    for stage in stages:  # in order, so one pass is enough
+        if found.intersection(stage.needs):
+            found.add(stage.name)
+    return found

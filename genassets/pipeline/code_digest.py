@@ -1,0 +1,111 @@
+"""Digest of the code that a stage's result depends on.
+
+Starting from the stage's own module, imports within the package are followed in the syntax tree, also those
+inside functions; nothing is imported. Comments, docstrings and layout do not count.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from genassets.pipeline.file_digests import FileMemory
+
+PACKAGE = "genassets"
+# Message texts, the stage contract and the version carry no numbers; a change in them must not rerun stages.
+WITHOUT_EFFECT = frozenset({"genassets", "genassets.errors", "genassets.stages", "genassets.stages.stage"})
+
+
+def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> dict[str, str]:
+    """Digest of every module of the package that ``roots`` reach by imports, by dotted name.
+
+    Args:
+        roots: dotted names of modules or packages.
+        source_root: directory that holds the package's directory.
+    """
+    digests: dict[str, str] = {}
+    waiting = list(roots)
+    seen: set[str] = set()
+    while waiting:
+        name = waiting.pop()
+        if name in seen:
+            continue
+        seen.add(name)
+        path = module_file(name, source_root)
+        if path is None:
+            continue
+        digest, imported = memory.of(path, _digest_and_imports(name, path.name == "__init__.py"))
+        if name not in WITHOUT_EFFECT:
+            digests[name] = digest
+            waiting.extend(imported)
+            # Importing a.b.c runs a/__init__.py and a/b/__init__.py as well.
+            parts = name.split(".")
+            waiting.extend(".".join(parts[:length]) for length in range(1, len(parts)))
+    return dict(sorted(digests.items()))
+
+
+def module_file(name: str, source_root: Path) -> Path | None:
+    """File of a module or package, or None where the name is an attribute or lies outside the package."""
+    base = source_root.joinpath(*name.split("."))
+    for path in (base.with_suffix(".py"), base / "__init__.py"):
+        if path.is_file():
+            return path
+    return None
+
+
+def code_digest_of(text: str) -> str:
+    """SHA-256 of the syntax tree without docstrings."""
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [item for item in node.body if not _is_bare_text(item)]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
+
+
+def _is_bare_text(node: ast.stmt) -> bool:
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )
+
+
+class _digest_and_imports:
+    """Callable for ``FileMemory.of``: the module's digest and the names it imports from the package."""
+
+    def __init__(self, name: str, is_package: bool) -> None:
+        self._package = name if is_package else name.rpartition(".")[0]
+
+    def __call__(self, path: Path) -> tuple[str, list[str]]:
+        text = path.read_text(encoding="utf-8")
+        return code_digest_of(text), sorted(self._imports(ast.parse(text)))
+
+    def _imports(self, tree: ast.Module) -> set[str]:
+        found: set[str] = set()
+        typing_only = {
+            id(inner) for node in ast.walk(tree) if _is_typing_block(node) for inner in ast.walk(node)
+        }
+        for node in ast.walk(tree):
+            if id(node) in typing_only:
+                continue
+            if isinstance(node, ast.Import):
+                found.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom):
+                base = node.module or ""
+                if node.level:
+                    parents = self._package.split(".")
+                    base = ".".join([*parents[: len(parents) - node.level + 1], *filter(None, [node.module])])
+                found.add(base)
+                found.update(f"{base}.{alias.name}" for alias in node.names)
+        return {name for name in found if name == PACKAGE or name.startswith(PACKAGE + ".")}
+
+
+def _is_typing_block(node: ast.AST) -> bool:
+    if not isinstance(node, ast.If):
+        return False
+    test = node.test
+    return (isinstance(test, ast.Name) and test.id == "TYPE_CHECKING") or (
+        isinstance(test, ast.Attribute) and test.attr == "TYPE_CHECKING"
+    )

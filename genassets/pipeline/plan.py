@@ -1,0 +1,234 @@
+"""What a run would do, before it does anything."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from genassets.errors import SpecError
+from genassets.pipeline.catalog import dependents, wanted_stages
+from genassets.pipeline.code_digest import code_tree
+from genassets.pipeline.file_digests import FileMemory
+from genassets.pipeline.fingerprint import components, differences, fingerprint
+from genassets.pipeline.home import Home
+from genassets.pipeline.source_digest import source_digest
+from genassets.pipeline.store import Store, StoredObject
+from genassets.specs.experiment import Experiment
+from genassets.specs.log_source import PandasetSource
+from genassets.stages.stage import Stage
+
+CODE_MEMORY = "code.json"
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Which stages have to run again, or alone.
+
+    ``start_from``: that stage and what hangs on it run even where the store has them. ``only``: nothing but
+    that stage; what it needs has to be in the store.
+    """
+
+    start_from: str | None = None
+    only: str | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage or shard of a run. ``key`` is "masks" or "masks[002]"."""
+
+    stage: Stage
+    shard: str | None
+    forced: bool
+
+    @property
+    def key(self) -> str:
+        return self.stage.name if self.shard is None else f"{self.stage.name}[{self.shard}]"
+
+
+@dataclass(frozen=True)
+class PlannedStep:
+    """A step with what is known of it before the run.
+
+    ``tree`` and ``fingerprint`` are None while an input still has to be made, for they depend on its content.
+    """
+
+    step: Step
+    action: str  # "cached" or "run"
+    reason: str
+    tree: Mapping[str, Any] | None
+    fingerprint: str | None
+    path: Path | None
+
+
+class Workflow:
+    """The steps of an experiment, and the fingerprint of each once its inputs are there."""
+
+    def __init__(
+        self, experiment: Experiment, catalog: Iterable[Stage], home: Home, selection: Selection = Selection()
+    ) -> None:
+        self.experiment = experiment
+        self.home = home
+        self.store = Store(home.store)
+        self.selection = selection
+        self.stages = self._selected(tuple(catalog))
+        self._code: dict[str, dict[str, str]] = {}
+        self._sources: dict[str, str] = {}
+
+    def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
+        names = [stage.name for stage in catalog]
+        for option, chosen in (("--from", self.selection.start_from), ("--only", self.selection.only)):
+            if chosen is not None and chosen not in names:
+                raise SpecError(f"{option} {chosen}: no such stage; stages are {', '.join(names)}")
+        wanted = self.experiment.header.stages
+        if self.selection.only is not None:
+            return wanted_stages(catalog, [self.selection.only])
+        stages = wanted_stages(catalog, wanted)
+        chosen = self.selection.start_from
+        if chosen is not None and chosen not in {stage.name for stage in stages}:
+            raise SpecError(
+                f"--from {chosen}: the experiment does not want this stage (stages: {list(wanted or ())})"
+            )
+        return stages
+
+    @property
+    def shards(self) -> tuple[str, ...]:
+        """Names of the logs, in the dataset's order."""
+        return tuple(source.name for source in self.experiment.sources)
+
+    def steps(self) -> list[Step]:
+        """Every stage and shard, in an order in which each comes after what it needs."""
+        forced: set[str] = set()
+        if self.selection.start_from is not None:
+            forced = dependents(self.stages, self.selection.start_from)
+        if self.selection.only is not None:
+            forced = {self.selection.only}
+        return [
+            Step(stage, shard, stage.name in forced)
+            for stage in self.stages
+            for shard in (self.shards if stage.sharded else (None,))
+        ]
+
+    def needed_keys(self, step: Step) -> dict[str, dict[str, str]]:
+        """Keys of the steps that a step reads, by stage and shard ("" for a stage without shards)."""
+        by_name = {stage.name: stage for stage in self.stages}
+        needed: dict[str, dict[str, str]] = {}
+        for name in step.stage.needs:
+            stage = by_name[name]
+            if not stage.sharded:
+                needed[name] = {"": name}
+            elif step.stage.sharded:
+                assert step.shard is not None
+                needed[name] = {step.shard: f"{name}[{step.shard}]"}
+            else:
+                needed[name] = {shard: f"{name}[{shard}]" for shard in self.shards}
+        return needed
+
+    def tree(self, step: Step, contents: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+        """The component tree of a step, given the content digest of its inputs by stage and shard."""
+        return components(
+            step.stage,
+            step.shard,
+            self.experiment.config(step.stage.name, step.shard),
+            contents,
+            self._code_of(step.stage),
+            self.experiment.header.seed,
+            self._source_of(step),
+        )
+
+    def _code_of(self, stage: Stage) -> dict[str, str]:
+        if stage.name not in self._code:
+            module = inspect.getmodule(stage.run)
+            assert module is not None
+            with FileMemory(self.home.cache / CODE_MEMORY) as memory:
+                source_root = Path(__file__).parents[2]
+                tree = code_tree([module.__name__, *stage.modules], source_root, memory)
+            self._code[stage.name] = tree
+        return self._code[stage.name]
+
+    def _source_of(self, step: Step) -> str | None:
+        if "source" not in step.stage.config.model_fields:
+            return None
+        source = next(source for source in self.experiment.sources if source.name == step.shard)
+        if not isinstance(source, PandasetSource):
+            return None
+        if source.name not in self._sources:
+            with FileMemory(self.home.cache / "sources" / f"{source.name}.json") as memory:
+                self._sources[source.name] = source_digest(source.root / source.name, memory)
+        return self._sources[source.name]
+
+
+def make_plan(workflow: Workflow) -> list[PlannedStep]:
+    """For every step whether the store has it, and if not, why it would run."""
+    store = workflow.store
+    done: dict[str, StoredObject] = {}
+    planned: list[PlannedStep] = []
+    for step in workflow.steps():
+        needed = workflow.needed_keys(step)
+        waiting = [key for shards in needed.values() for key in shards.values() if key not in done]
+        if waiting:
+            names = ", ".join(waiting[:3]) + (f" and {len(waiting) - 3} more" if len(waiting) > 3 else "")
+            planned.append(
+                PlannedStep(step, "run", f"reads {names}, which has to run first", None, None, None)
+            )
+            continue
+        contents = {
+            name: {s: done[key].content for s, key in shards.items()} for name, shards in needed.items()
+        }
+        tree = workflow.tree(step, contents)
+        digest = fingerprint(tree)
+        stored = store.find(step.stage.name, digest)
+        path = store.path_of(step.stage.name, digest)
+        if stored is not None and not step.forced:
+            done[step.key] = stored
+            planned.append(PlannedStep(step, "cached", "the store has it", tree, digest, path))
+        elif stored is not None:
+            planned.append(
+                PlannedStep(step, "run", "asked for again by --from or --only", tree, digest, path)
+            )
+        else:
+            planned.append(PlannedStep(step, "run", reason_to_run(store, tree), tree, digest, path))
+    return planned
+
+
+def nearest_stored(
+    store: Store, tree: Mapping[str, Any]
+) -> tuple[StoredObject, list[tuple[str, Any, Any]]] | None:
+    """The stored object of the same stage and shard that differs least (the newest of equals), and how."""
+    best: tuple[StoredObject, list[tuple[str, Any, Any]]] | None = None
+    for stored in reversed(store.all_of(str(tree["stage"]))):
+        if stored.components.get("shard") != tree["shard"]:
+            continue
+        changed = list(differences(stored.components, tree))
+        if best is None or len(changed) < len(best[1]):
+            best = (stored, changed)
+    return best
+
+
+def reason_to_run(store: Store, tree: Mapping[str, Any]) -> str:
+    """One line that says why the store has no object for a component tree."""
+    nearest = nearest_stored(store, tree)
+    if nearest is None:
+        return "never made before"
+    changed = nearest[1]
+    if not changed:
+        return "its stored object is incomplete"
+    shown = ", ".join(describe_difference(*change) for change in changed[:2])
+    return f"changed: {shown}" + (f" and {len(changed) - 2} more" if len(changed) > 2 else "")
+
+
+def describe_difference(name: str, before: Any, after: Any) -> str:
+    """A field's change in words; digests are cut short and code is named without them."""
+    if name.startswith("code/"):
+        verb = "new" if before is None else "gone" if after is None else "edited"
+        return f"code {name.removeprefix('code/')} {verb}"
+    if name.startswith(("inputs/", "source")):
+        return f"{name} has other content"
+    return f"{name} {_short(before)} -> {_short(after)}"
+
+
+def _short(value: Any) -> str:
+    text = "absent" if value is None else str(value)
+    return text if len(text) <= 60 else text[:57] + "..."
