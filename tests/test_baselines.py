@@ -15,7 +15,7 @@ from genassets.evaluation.viewpoint import (
     view_group,
     viewpoint_of,
 )
-from genassets.geometry.transforms import make_pose, yaw_pose
+from genassets.geometry.transforms import invert_pose, make_pose, yaw_pose
 
 
 def test_mean_colour_weighs_pixels_equally() -> None:
@@ -85,10 +85,11 @@ def test_mask_at_the_compared_size_needs_more_than_half_of_a_pixel() -> None:
 def test_viewpoint_is_the_camera_in_the_box_frame() -> None:
     # The actor heads along world +y at (10, 20, 1); a camera 5 m further along +y stands in front of it.
     world_from_box = yaw_pose(np.pi / 2, (10.0, 20.0, 1.0))
-    in_front = viewpoint_of(make_pose(np.eye(3), (10.0, 25.0, 1.0)), world_from_box)
+    box_from_world = invert_pose(world_from_box)
+    in_front = viewpoint_of(box_from_world @ make_pose(np.eye(3), (10.0, 25.0, 1.0)))
     assert in_front.position == pytest.approx((5.0, 0.0, 0.0), abs=1e-12)
     assert in_front.azimuth == pytest.approx(0.0, abs=1e-9)
-    on_its_left = viewpoint_of(make_pose(np.eye(3), (7.0, 20.0, 1.0)), world_from_box)
+    on_its_left = viewpoint_of(box_from_world @ make_pose(np.eye(3), (7.0, 20.0, 1.0)))
     assert on_its_left.azimuth == pytest.approx(90.0)
     assert on_its_left.distance == pytest.approx(3.0)
 

@@ -4,6 +4,7 @@ crop.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -42,31 +43,27 @@ def place_crop(image: NDArray, source: Bounds, target: Bounds, region: tuple[int
 
     The affine map that takes the corners of `source` in `image` (H, W, 3) to the corners of `target` is
     applied to the image, and the part inside `region` (integer x0, y0, x1, y1 in the target's pixels) is
-    returned, float32 (h, w, 3). Pixels past the image's edge repeat the edge. Shrinking averages: the source
-    is first area-resized by the map's scale, so fine texture does not alias. Raises ValueError for bounds
-    without area.
+    returned, float32 (h, w, 3). Pixels past the image's edge repeat the edge. Shrinking averages over
+    each pixel's area, so fine texture does not alias. Raises ValueError for bounds without area.
     """
     for name, bounds in (("source", source), ("target", target)):
         if bounds[2] <= bounds[0] or bounds[3] <= bounds[1]:
             raise ValueError(f"{name} bounds {bounds} have no area")
     scale_x = (target[2] - target[0]) / (source[2] - source[0])
     scale_y = (target[3] - target[1]) / (source[3] - source[1])
-    height, width = image.shape[:2]
-    shrunk_width = max(1, round(width * min(scale_x, 1.0)))
-    shrunk_height = max(1, round(height * min(scale_y, 1.0)))
-    if (shrunk_width, shrunk_height) != (width, height):
-        image = cv2.resize(image, (shrunk_width, shrunk_height), interpolation=cv2.INTER_AREA)
-    # From target pixel centres to source pixel centres; warpAffine counts from pixel centres, hence the
-    # halves.
-    to_x, to_y = shrunk_width / width, shrunk_height / height
-    slope_x, slope_y = to_x / scale_x, to_y / scale_y
-    offset_x = (region[0] + 0.5 - target[0]) * slope_x + source[0] * to_x - 0.5
-    offset_y = (region[1] + 0.5 - target[1]) * slope_y + source[1] * to_y - 0.5
-    placed = cv2.warpAffine(
+    # Several samples a pixel, averaged, wherever the source has more pixels than the target.
+    fine_x, fine_y = max(1, math.ceil(1 / scale_x - 1e-9)), max(1, math.ceil(1 / scale_y - 1e-9))
+    width, height = region[2] - region[0], region[3] - region[1]
+    slope_x, slope_y = 1 / (scale_x * fine_x), 1 / (scale_y * fine_y)
+    # From fine pixel centres to source pixel centres; warpAffine counts from pixel centres, hence the halves.
+    offset_x = source[0] + (region[0] - target[0]) / scale_x + 0.5 * slope_x - 0.5
+    offset_y = source[1] + (region[1] - target[1]) / scale_y + 0.5 * slope_y - 0.5
+    fine = cv2.warpAffine(
         image.astype(np.float32),
         np.array([[slope_x, 0.0, offset_x], [0.0, slope_y, offset_y]]),
-        (region[2] - region[0], region[3] - region[1]),
+        (width * fine_x, height * fine_y),
         flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
         borderMode=cv2.BORDER_REPLICATE,
     )
+    placed = fine.reshape(height, fine_y, width, fine_x, 3).mean(axis=(1, 3))
     return np.asarray(placed, dtype=np.float32)

@@ -26,7 +26,6 @@ from genassets.evaluation.viewpoint import (
     ViewThresholds,
     nearest_view,
     view_group,
-    viewpoint_of,
 )
 
 if TYPE_CHECKING:
@@ -42,10 +41,10 @@ CROP_MARGIN = 0.15
 class ImageRenderer(Protocol):
     """The part of a scene renderer that this evaluation needs."""
 
-    def render_intrinsics(self, log: str, camera: str) -> Intrinsics: ...
+    def render_intrinsics(self, log: Log, camera: str) -> Intrinsics: ...
 
     def render_image(
-        self, log: str, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
+        self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
     ) -> NDArray[np.float32]: ...
 
 
@@ -111,26 +110,6 @@ class _TrainingActor:
     colour: ColourMean
 
 
-def observe(
-    log: Log, frame: int, camera: str, actor_id: str, bounds: Bounds,
-    mask: Callable[[], NDArray[np.bool_]], segmenter: str,
-) -> Observation:  # fmt: skip
-    """An observation of a log's actor, with the viewpoint at the camera's own time stamp."""
-    stream, track = log.cameras[camera], log.track(actor_id)
-    world_from_box = track.pose_at(float(stream.times[frame]))
-    return Observation(
-        log=log.name,
-        frame=frame,
-        camera=camera,
-        actor_id=actor_id,
-        actor_class=track.actor_class,
-        bounds=bounds,
-        mask=mask,
-        segmenter=segmenter,
-        viewpoint=viewpoint_of(stream.world_from_camera[frame], world_from_box),
-    )
-
-
 def evaluate_log(
     log: Log,
     training: Sequence[Observation],
@@ -168,7 +147,7 @@ def evaluate_log(
                 skipped.append(Skipped(observation, "mask_too_small"))
                 continue
             scored.append(
-                _score(observation, region, crop(image, region), mask, scale,
+                _score(log, observation, region, crop(image, region), mask, scale,
                        known.get(observation.actor_id), renderer, lpips, comparison)
             )  # fmt: skip
         on_frame(done + 1, len(by_image))
@@ -177,7 +156,7 @@ def evaluate_log(
 
 def image_scale(log: Log, camera: str, renderer: ImageRenderer) -> ImageScale:
     """How a camera's stored images relate to the renderer's."""
-    stored, rendered = log.cameras[camera].intrinsics, renderer.render_intrinsics(log.name, camera)
+    stored, rendered = log.cameras[camera].intrinsics, renderer.render_intrinsics(log, camera)
     return ImageScale(stored.width, stored.height, rendered.width, rendered.height)
 
 
@@ -221,6 +200,7 @@ def _stored_crop(stored: NDArray[np.uint8], bounds: Bounds) -> tuple[NDArray[np.
 
 
 def _score(
+    log: Log,
     observation: Observation,
     region: tuple[int, int, int, int],
     truth: NDArray[np.float32],
@@ -231,7 +211,7 @@ def _score(
     lpips: Lpips | None,
     comparison: Comparison,
 ) -> Scored:
-    rendered = renderer.render_image(observation.log, observation.camera, observation.frame, region)
+    rendered = renderer.render_image(log, observation.camera, observation.frame, region)
     predictions = {"model": np.clip(rendered, 0.0, 1.0).astype(np.float32)}
     difference, nearest = None, None
     if actor is not None:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.geometry.transforms import invert_pose, transform_points
-
 
 @dataclass(frozen=True)
 class Viewpoint:
@@ -54,9 +52,9 @@ class ViewDifference:
         )
 
 
-def viewpoint_of(world_from_camera: NDArray, world_from_box: NDArray) -> Viewpoint:
-    """The view that a camera pose (4, 4) has of a box pose (4, 4)."""
-    x, y, z = transform_points(invert_pose(world_from_box), np.asarray(world_from_camera)[:3, 3])
+def viewpoint_of(box_from_camera: NDArray) -> Viewpoint:
+    """The viewpoint of a camera whose pose (4, 4) in the box frame is given."""
+    x, y, z = box_from_camera[:3, 3]
     return Viewpoint((float(x), float(y), float(z)))
 
 

@@ -6,6 +6,7 @@ skipped.parquet and pictures. docs/evaluation.md says what each measure means.
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,7 @@ def run(
     tables = inputs.shards("filter_occlusion")
     for index, (shard, ingested) in enumerate(inputs.shards("ingest").items()):
         log = open_ingested(ingested)
-        log_training, log_held_out = _observations(log, tables[shard], config.split)
+        log_training, log_held_out = _observations(tables[shard], config.split)
         library = frozenset(renderer.assets.loc[renderer.assets["log"] == log.name, "actor_id"])
 
         def report(done: int, total: int, index: int = index, name: str = log.name) -> None:
@@ -99,27 +100,35 @@ def run(
     return [Metric(*mean) for mean in means(observations)] + _counts(scored, skipped)
 
 
-def _observations(log: Log, table: Path, split: Split) -> tuple[list[Observation], list[Observation]]:
+def _observations(table: Path, split: Split) -> tuple[list[Observation], list[Observation]]:
     """Kept observations of the training frames and of the held-out frames."""
-    from genassets.curation.object_table import mask_of, read_object_table
-    from genassets.evaluation.sparse_view import observe
+    from genassets.curation.object_table import (
+        bounds_of,
+        box_from_camera_of,
+        mask_of,
+        read_object_table,
+    )
+    from genassets.evaluation.sparse_view import Observation
+    from genassets.evaluation.viewpoint import viewpoint_of
 
     rows = read_object_table(table / "objects.parquet")
     training: list[Observation] = []
     held_out: list[Observation] = []
-    for _, row in rows[rows["kept"]].iterrows():
-        frame, camera = int(row["frame"]), str(row["camera"])
+    for row in rows[rows["kept"]].itertuples(index=False):
+        frame, camera = int(row.frame), str(row.camera)
         trains = split.is_training(frame)
         if camera not in split.train_cameras if trains else camera != split.camera:
             continue
-        observation = observe(
-            log,
-            frame,
-            camera,
-            str(row["actor_id"]),
-            (float(row["x0"]), float(row["y0"]), float(row["x1"]), float(row["y1"])),
-            lambda row=row: mask_of(row),
-            str(row["segmenter"]),
+        observation = Observation(
+            log=str(row.log),
+            frame=frame,
+            camera=camera,
+            actor_id=str(row.actor_id),
+            actor_class=str(row.actor_class),
+            bounds=bounds_of(row),
+            mask=partial(mask_of, row),
+            segmenter=str(row.segmenter),
+            viewpoint=viewpoint_of(box_from_camera_of(row)),
         )
         (training if trains else held_out).append(observation)
     return training, held_out
@@ -176,8 +185,8 @@ def _picture_actors(scored: list[Scored], count: int, pictures: PictureList) -> 
             f"actors_{name}",
             sheet,
             f"Held-out views: {name} actors",
-            f"{len(chosen)} of {len(ranked)} actors, ranked by mean masked PSNR over their held-out views; each "
-            "by the view nearest to its mean. Error: absolute, inside the mask, brightest at 0.5 and above.",
+            f"{len(chosen)} of {len(ranked)} actors, ranked by mean masked PSNR over their held-out views; "
+            "each by the view nearest to its mean. Error: absolute, in the mask, brightest at 0.5 and above.",
         )
 
 
@@ -195,7 +204,7 @@ def _picture_whole_frames(
         weights[item.observation.camera, item.observation.frame] += 100 if item.group == "moved" else 1
     for (camera, frame), _ in sorted(weights.items(), key=lambda entry: (-entry[1], entry[0]))[:count]:
         truth = image_scale(log, camera, renderer).image(log.cameras[camera].image(frame))
-        rendered = renderer.render_image(log.name, camera, frame, None)
+        rendered = renderer.render_image(log, camera, frame)
         pictures.add(
             f"frame_{log.name}_{camera}_{frame:03d}",
             side_by_side([truth, rendered]),

@@ -1,0 +1,217 @@
+"""Sparse-view evaluation on a constructed log whose every number is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from genassets.driving.log import CameraStream, Log
+from genassets.evaluation.pictures import PictureRow, picture_sheet
+from genassets.evaluation.sparse_view import Comparison, Observation, Scored, Skipped, evaluate_log
+from genassets.evaluation.sparse_view_pictures import HEADINGS, picture_row, representative_observations
+from genassets.evaluation.sparse_view_tables import actor_table, means, observation_table, view_table
+from genassets.evaluation.viewpoint import Viewpoint
+from genassets.geometry.cameras import Intrinsics
+
+WIDTH, HEIGHT, FRAMES = 128, 64, 4
+BOX = (32.0, 16.0, 80.0, 48.0)
+GREY, ACTOR = 60, 180
+
+
+class HalfSizeRenderer:
+    """Renders at half size; every pixel is off by `error` from the actor's value of 180 / 255."""
+
+    def __init__(self, error: float):
+        self.error = error
+
+    def render_intrinsics(self, log: Log, camera: str) -> Intrinsics:
+        return log.cameras[camera].intrinsics.resized(WIDTH // 2, HEIGHT // 2)
+
+    def render_image(
+        self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
+    ) -> NDArray[np.float32]:
+        x0, y0, x1, y1 = region or (0, 0, WIDTH // 2, HEIGHT // 2)
+        return np.full((y1 - y0, x1 - x0, 3), ACTOR / 255 + self.error, dtype=np.float32)
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Log:
+    """Four frames: a box of 180 on 60; frame 0's box is darker by 51 (0.2)."""
+    paths = []
+    for frame in range(FRAMES):
+        image = np.full((HEIGHT, WIDTH, 3), GREY, dtype=np.uint8)
+        image[16:48, 32:80] = ACTOR - (51 if frame == 0 else 0)
+        paths.append(tmp_path / f"{frame:02d}.png")
+        Image.fromarray(image).save(paths[-1])
+    stream = CameraStream(
+        name="front_camera",
+        intrinsics=Intrinsics(100.0, 100.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT),
+        world_from_camera=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        times=np.arange(FRAMES) * 0.1,
+        image_paths=tuple(paths),
+    )
+    return Log(
+        name="made",
+        root=tmp_path,
+        start_time=0.0,
+        frame_count=FRAMES,
+        frame_times=np.arange(FRAMES) * 0.1,
+        world_from_ego=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        world_from_lidar=np.tile(np.eye(4), (FRAMES, 1, 1)),
+        cameras={"front_camera": stream},
+        sweep_paths=(None,) * FRAMES,
+        tracks=(),
+        time_of_day="day",
+        dropped_labels=(),
+        missing=(),
+    )
+
+
+def box_mask() -> NDArray[np.bool_]:
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[16:48, 32:80] = True
+    return mask
+
+
+def speck() -> NDArray[np.bool_]:
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[20:24, 40:44] = True  # four pixels at half size
+    return mask
+
+
+def observed(
+    frame: int, position: tuple[float, float, float], actor: str = "a", small: bool = False, kind: str = "Car"
+) -> Observation:
+    mask = speck if small else box_mask
+    return Observation(
+        "made", frame, "front_camera", actor, kind, BOX, mask, "truth", Viewpoint(position)
+    )  # fmt: skip
+
+
+TRAINING = [observed(0, (10.0, 0.0, 0.0)), observed(2, (12.0, 0.0, 0.0))]
+HELD_OUT = [
+    observed(1, (12.4, 0.0, 0.0)),  # nearest is frame 2, 0.4 m: same
+    observed(3, (13.0, 0.0, 0.0)),  # 1 m from frame 2: moved
+    observed(1, (12.0, 0.0, 0.0), actor="unseen", kind="Bus"),
+    observed(1, (12.0, 0.0, 0.0), actor="stranger"),
+    observed(3, (12.0, 0.0, 0.0), small=True),
+]
+
+
+def score(
+    log: Log, training: list[Observation], held_out: list[Observation], library: frozenset[str], error: float
+) -> tuple[list[Scored], list[Skipped]]:
+    renderer = HalfSizeRenderer(error)
+    return evaluate_log(
+        log, training, held_out, library, renderer, None, Comparison(), lambda done, total: None
+    )
+
+
+@pytest.fixture
+def table(log: Log) -> pd.DataFrame:
+    scored, skipped = evaluate_log(
+        log,
+        TRAINING,
+        HELD_OUT,
+        frozenset({"a", "unseen"}),
+        HalfSizeRenderer(0.1),
+        None,
+        Comparison(),
+        lambda a, b: None,
+    )
+    assert [(s.observation.actor_id, s.reason) for s in skipped] == [
+        ("stranger", "not_in_library"),
+        ("a", "mask_too_small"),
+    ]
+    frame: pd.DataFrame = observation_table(scored).to_pandas()
+    return frame
+
+
+def value(table: pd.DataFrame, frame: int, predictor: str, measure: str = "psnr", actor: str = "a") -> float:
+    rows = table[(table["frame"] == frame) & (table["predictor"] == predictor) & (table["actor_id"] == actor)]
+    assert len(rows) == 1
+    return float(rows[measure].iloc[0])
+
+
+def test_predictors_get_their_closed_form_psnr(table: pd.DataFrame) -> None:
+    assert value(table, 1, "model") == pytest.approx(20.0, abs=1e-4)
+    # Training pixels are half 129, half 180: the mean is 0.1 below the held-out colour.
+    assert value(table, 3, "mean_colour") == pytest.approx(20.0, abs=1e-3)
+    # The nearest training crop is frame 2's, which equals the held-out frame.
+    assert value(table, 1, "nearest_crop") > 90.0
+    assert value(table, 1, "model", "mask_px") == 24 * 16
+
+
+def test_observations_fall_into_groups(table: pd.DataFrame) -> None:
+    groups = {(r.actor_id, r.frame): r.group for r in table.itertuples()}
+    assert groups == {("a", 1): "same", ("a", 3): "moved", ("unseen", 1): "unseen"}
+    model = table[table["predictor"] == "model"]
+    assert model.loc[model["frame"] == 3, "distance_metres"].iloc[0] == pytest.approx(1.0)
+    assert set(table.loc[table["actor_id"] == "unseen", "predictor"]) == {"model"}
+
+
+def test_means_keep_groups_apart_and_state_gains(table: pd.DataFrame) -> None:
+    rows = {(m.setting, m.class_name, m.metric, m.method.split(";")[0]): m for m in means(table)}
+    assert rows["sparse_view/all", "all", "psnr", "model"].n == 2
+    assert rows["sparse_view/moved", "Car", "psnr", "model"].n == 1
+    assert rows["sparse_view/unseen", "Bus", "psnr", "model"].value == pytest.approx(20.0, abs=1e-4)
+    assert ("sparse_view/unseen", "Bus", "psnr", "mean_colour") not in rows
+    gain = rows["sparse_view/moved", "all", "psnr_gain", "model less mean_colour"]
+    assert gain.value == pytest.approx(0.0, abs=1e-3)
+    assert "mask=truth" in gain.method
+    # An exact nearest crop is capped, so the mean stays finite.
+    assert rows["sparse_view/all", "all", "psnr", "nearest_crop"].value <= 100.0
+
+
+def test_gain_over_a_worse_baseline_is_positive(log: Log) -> None:
+    scored, _ = score(log, TRAINING[:1], HELD_OUT[:2], frozenset({"a"}), error=0.02)
+    rows = means(observation_table(scored).to_pandas())
+    gains = {(m.setting, m.metric, m.method.split(";")[0]): m.value for m in rows}
+    gain = gains["sparse_view/moved", "psnr_gain", "model less nearest_crop"]
+    assert gain == pytest.approx(
+        20 * np.log10(0.2 / 0.02), abs=1e-2
+    )  # the only crop is 0.2 off, the model 0.02
+
+
+def test_means_of_nothing_are_none() -> None:
+    assert means(observation_table([]).to_pandas()) == []
+
+
+def test_actor_table_has_one_row_an_actor_and_predictor(table: pd.DataFrame) -> None:
+    actors = actor_table(table)
+    row = actors[(actors["actor_id"] == "a") & (actors["predictor"] == "model")].iloc[0]
+    assert (row["observations"], row["moved"]) == (2, 1)
+    assert row["psnr"] == pytest.approx(20.0, abs=1e-4)
+    assert len(actors) == 4
+
+
+def test_views_say_from_where_an_actor_was_seen() -> None:
+    views = view_table(TRAINING, HELD_OUT[:1]).to_pandas()
+    assert views["training"].tolist() == [True, True, False]
+    assert views["range"].tolist() == pytest.approx([10.0, 12.0, 12.4])
+
+
+def test_pictures_show_one_view_an_actor_best_first(log: Log) -> None:
+    training = [*TRAINING, observed(0, (10.0, 0.0, 0.0), actor="dark")]
+    held_out = [*HELD_OUT[:2], observed(2, (10.0, 0.0, 0.0), actor="dark")]
+    scored, _ = evaluate_log(
+        log,
+        training,
+        held_out,
+        frozenset({"a", "dark"}),
+        HalfSizeRenderer(0.1),
+        None,
+        Comparison(),
+        lambda a, b: None,
+    )
+    ranked = representative_observations(scored)
+    assert len(ranked) == 2
+    sheet = picture_sheet(HEADINGS, [picture_row(item) for item in ranked])
+    assert sheet.dtype == np.uint8 and sheet.shape[2] == 3
+    with pytest.raises(ValueError, match="panels"):
+        picture_sheet(HEADINGS, [PictureRow("short", [np.zeros((4, 4, 3))])])
