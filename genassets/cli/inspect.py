@@ -42,7 +42,7 @@ def inspect(
 
 
 def parse_frames(text: str, frame_count: int) -> list[int]:
-    """Frame numbers from '0,4,8:12' (8 to 11), 'all', or '' (first, middle, last); SpecError when malformed."""
+    """Frame numbers of '0,4,8:12' (8 to 11), 'all', or '' (first, middle, last); SpecError if malformed."""
     from genassets.errors import SpecError
 
     if text == "":
@@ -95,8 +95,8 @@ def _print(summary: dict[str, Any]) -> None:
     console = Console()
     console.print(
         f"[bold]{summary['name']}[/bold]: {summary['frames']} frames in {summary['seconds']:.1f} s, "
-        f"{summary['time_of_day']}, ego car drives {summary['ego_metres']:.1f} m, {summary['sweeps']} sweeps, "
-        f"{summary['tracks']} actors ({summary['twins_joined']} joined from twins)"
+        f"{summary['time_of_day']}, ego car drives {summary['ego_metres']:.1f} m, "
+        f"{summary['sweeps']} sweeps, {summary['tracks']} actors ({summary['twins_joined']} joined twins)"
     )
     cameras = Table("camera", "images", "size", "focal px", "after LiDAR ms", title="Cameras")
     for camera in summary["cameras"]:
