@@ -14,6 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("flows",),
     ("genassets.cli",),
+    ("genassets.bench",),
     ("genassets.tracking", "genassets.reporting"),
     ("genassets.pipeline",),
     ("genassets.stages",),
