@@ -1,0 +1,92 @@
+"""Which actors are shown all around, and which of their sides no training view saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pandas as pd
+
+BEHIND_DEGREES = 60.0
+"""A view is from behind when its azimuth lies within this angle of 180 degrees."""
+SEEN_DEGREES = 45.0
+"""A turn counts as seen when a training view lies within this angle of its azimuth."""
+
+
+@dataclass(frozen=True)
+class TurnedActor:
+    """One actor to turn: who it is, why it was chosen, and the azimuths of its training views in degrees."""
+
+    log: str
+    actor_id: str
+    actor_class: str
+    size: tuple[float, float, float]
+    reasons: tuple[str, ...]
+    psnr: float | None
+    seen_azimuths: tuple[float, ...]
+
+    def has_seen(self, azimuth: float) -> bool:
+        """Whether a training view lies within `SEEN_DEGREES` of an azimuth."""
+        return any(angle_between(azimuth, seen) <= SEEN_DEGREES for seen in self.seen_azimuths)
+
+
+def angle_between(first: float, second: float) -> float:
+    """The smaller angle between two azimuths, degrees in [0, 180]."""
+    return abs((first - second + 180.0) % 360.0 - 180.0)
+
+
+def select_actors(
+    assets: pd.DataFrame, actors: pd.DataFrame, views: pd.DataFrame, count: int
+) -> list[TurnedActor]:
+    """The `count` best, median and worst actors by held-out PSNR, the most observed one of each class, and
+    the `count` most observed that no training view saw from behind; each once, in this order, with all its
+    reasons.
+
+    Args:
+        assets: log, actor_id, actor_class, size_l, size_w, size_h, observations of every reconstructed actor.
+        actors: the evaluation's means per actor (`sparse_view_tables.actor_table`).
+        views: from where each was seen (`sparse_view_tables.view_table`).
+    """
+    model = actors[actors["predictor"] == "model"].sort_values(["psnr", "log", "actor_id"], ascending=False)
+    ranked = list(zip(model["log"], model["actor_id"], strict=True))
+    middle = max(0, (len(ranked) - count) // 2)
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for reason, chosen in (
+        ("best", ranked[:count]),
+        ("median", ranked[middle : middle + count]),
+        ("worst", ranked[::-1][:count]),
+    ):
+        for key in chosen:
+            reasons.setdefault(key, []).append(reason)
+    observed = assets.sort_values(["observations", "log", "actor_id"], ascending=[False, True, True])
+    for name, group in observed.groupby("actor_class", sort=True):
+        first = group.iloc[0]
+        reasons.setdefault((first["log"], first["actor_id"]), []).append(f"most observed {name}")
+    azimuths = {
+        (log, actor): tuple(float(a) for a in group["azimuth"])
+        for (log, actor), group in views[views["training"]].groupby(["log", "actor_id"])
+    }
+    for key in _never_from_behind(observed, azimuths)[:count]:
+        reasons.setdefault(key, []).append("never seen from behind")
+    asset_of = assets.set_index(["log", "actor_id"])
+    psnr_of = model.set_index(["log", "actor_id"])["psnr"].to_dict()
+    turned = []
+    for key, why in reasons.items():
+        asset = asset_of.loc[key]
+        size = (float(asset["size_l"]), float(asset["size_w"]), float(asset["size_h"]))
+        turned.append(
+            TurnedActor(
+                *key, str(asset["actor_class"]), size, tuple(why), psnr_of.get(key), azimuths.get(key, ())
+            )
+        )
+    return turned
+
+
+def _never_from_behind(
+    observed: pd.DataFrame, azimuths: dict[tuple[str, str], tuple[float, ...]]
+) -> list[tuple[str, str]]:
+    keys = zip(observed["log"], observed["actor_id"], strict=True)
+    return [
+        key
+        for key in keys
+        if key in azimuths and all(angle_between(a, 180.0) > BEHIND_DEGREES for a in azimuths[key])
+    ]
