@@ -6,10 +6,22 @@ from collections.abc import Iterable, Mapping
 
 from pydantic import BaseModel
 
-from genassets.stages import ingest
+from genassets.stages import (
+    evaluate_reconstruction,
+    filter_occlusion,
+    ingest,
+    prepare_masks,
+    reconstruct,
+)
 from genassets.stages.stage import Stage
 
-CATALOG: tuple[Stage, ...] = (ingest.STAGE,)
+CATALOG: tuple[Stage, ...] = (
+    ingest.STAGE,
+    prepare_masks.STAGE,
+    filter_occlusion.STAGE,
+    reconstruct.STAGE,
+    evaluate_reconstruction.STAGE,
+)
 
 
 def configs(catalog: Iterable[Stage]) -> dict[str, type[BaseModel]]:

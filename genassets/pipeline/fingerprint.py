@@ -37,28 +37,26 @@ def components(
     inputs: Mapping[str, Mapping[str, str]],
     code: Mapping[str, str],
     seed: int,
-    source: str | None = None,
+    sources: Mapping[str, str],
 ) -> dict[str, Any]:
     """The tree that a stage's fingerprint is the digest of.
 
     Args:
         inputs: content digest of each needed object, by stage and shard.
         code: digest of each module, as by ``code_digest.code_tree``.
-        source: content digest of files that the stage reads from outside the store.
+        sources: content digests of what the stage reads from outside the store, by config field.
     """
-    tree: dict[str, Any] = {
+    return {
         "stage": stage.name,
         "version": stage.version,
         "shard": shard or "",
         "config": config.model_dump(mode="json", exclude=set(stage.runtime_only)),
         "inputs": {name: dict(shards) for name, shards in inputs.items()},
         "code": dict(code),
+        "sources": dict(sources),
         "seed": seed,
         "environment": dict(numeric_environment()),
     }
-    if source is not None:
-        tree["source"] = source
-    return tree
 
 
 def canonical_json(value: Any) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 from genassets.errors import SpecError
 from genassets.pipeline.catalog import dependents, wanted_stages
 from genassets.pipeline.code_digest import code_tree
-from genassets.pipeline.file_digests import FileMemory
+from genassets.pipeline.file_digests import FileMemory, sha256_of
 from genassets.pipeline.fingerprint import components, differences, fingerprint
 from genassets.pipeline.home import Home
 from genassets.pipeline.source_digest import source_digest
@@ -75,7 +75,7 @@ class Workflow:
         self.selection = selection
         self.stages = self._selected(tuple(catalog))
         self._code: dict[str, dict[str, str]] = {}
-        self._sources: dict[str, str] = {}
+        self._logs: dict[str, str] = {}
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
         names = [stage.name for stage in catalog]
@@ -135,7 +135,7 @@ class Workflow:
             contents,
             self._code_of(step.stage),
             self.experiment.header.seed,
-            self._source_of(step),
+            self._sources_of(step),
         )
 
     def _code_of(self, stage: Stage) -> dict[str, str]:
@@ -148,16 +148,26 @@ class Workflow:
             self._code[stage.name] = tree
         return self._code[stage.name]
 
-    def _source_of(self, step: Step) -> str | None:
-        if "source" not in step.stage.config.model_fields:
-            return None
-        source = next(source for source in self.experiment.sources if source.name == step.shard)
-        if not isinstance(source, PandasetSource):
-            return None
-        if source.name not in self._sources:
-            with FileMemory(self.home.cache / "sources" / f"{source.name}.json") as memory:
-                self._sources[source.name] = source_digest(source.root / source.name, memory)
-        return self._sources[source.name]
+    def _sources_of(self, step: Step) -> dict[str, str]:
+        """Digests of what a step reads from outside the store: its log's files, files that its config names."""
+        config = self.experiment.config(step.stage.name, step.shard)
+        sources: dict[str, str] = {}
+        for name in type(config).model_fields:
+            value = getattr(config, name)
+            if isinstance(value, PandasetSource):
+                sources[name] = self._log_digest(value)
+            elif isinstance(value, Path):
+                if not value.is_file():
+                    raise SpecError(f"{step.stage.name}.{name} is {value}: no such file")
+                with FileMemory(self.home.cache / "sources" / "files.json") as memory:
+                    sources[name] = memory.of(value.resolve(), sha256_of)
+        return sources
+
+    def _log_digest(self, source: PandasetSource) -> str:
+        if source.name not in self._logs:
+            with FileMemory(self.home.cache / "sources" / f"log-{source.name}.json") as memory:
+                self._logs[source.name] = source_digest(source.root / source.name, memory)
+        return self._logs[source.name]
 
 
 def make_plan(workflow: Workflow) -> list[PlannedStep]:
@@ -224,7 +234,7 @@ def describe_difference(name: str, before: Any, after: Any) -> str:
     if name.startswith("code/"):
         verb = "new" if before is None else "gone" if after is None else "edited"
         return f"code {name.removeprefix('code/')} {verb}"
-    if name.startswith(("inputs/", "source")):
+    if name.startswith(("inputs/", "sources/")):
         return f"{name} has other content"
     return f"{name} {_short(before)} -> {_short(after)}"
 
