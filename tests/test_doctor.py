@@ -88,6 +88,7 @@ def test_doctor_tells_what_missing_weights_cost_and_is_content(
 ) -> None:
     monkeypatch.setenv("GENASSETS_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(doctor, "IMPORTED", ())  # importing them all takes seconds
     result = CliRunner().invoke(cli.app, ["doctor", "--json"])
     document = json.loads(result.stdout)
     assert document["ok"]
@@ -97,6 +98,14 @@ def test_doctor_tells_what_missing_weights_cost_and_is_content(
     assert "GrabCut" in findings["weights sam-encoder"]["cost"]
     assert findings["npm"]["state"] == "note"
     assert findings["torch"]["state"] == "ok"
+
+
+def test_doctor_shows_why_a_package_does_not_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "IMPORTED", ("json", "no_such_package"))
+    (finding,) = doctor._loading()
+    assert finding.subject == "import no_such_package"
+    assert finding.state == "missing"
+    assert "No module named" in finding.found
 
 
 def test_doctor_ends_with_6_when_something_needed_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,6 +88,21 @@ def test_a_changed_requirement_sets_up_again(checkout: Path) -> None:
     assert not (checkout / ".venv" / ".set-up").exists()
 
 
+def test_without_the_right_to_install_the_line_to_type_is_printed(checkout: Path, tmp_path: Path) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    # Debian's python without its package for virtual environments, and a user who is not root.
+    python = 'case "$2" in "import ensurepip") exit 1 ;; *print*) echo python3.11-venv ;; esac'
+    for name, script in {"bare-python": python, "id": "echo 1000"}.items():
+        (programs / name).write_text(f"#!/bin/sh\n{script}\n")
+        (programs / name).chmod(0o755)
+    (checkout / ".venv" / ".set-up").unlink()
+    path = f"{programs}:{os.environ['PATH']}"
+    finished = call(checkout, "--version", GENASSETS_PYTHON="bare-python", PATH=path)
+    assert finished.returncode == 6
+    assert finished.stderr.splitlines()[-1].endswith("sudo apt-get install -y python3.11-venv")
+
+
 def test_another_build_of_torch_sets_up_again(checkout: Path) -> None:
     finished = call(checkout, "--version", GENASSETS_TORCH="cuda", GENASSETS_PYTHON="no-such-python")
     assert "setting up" in finished.stderr
