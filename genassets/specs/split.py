@@ -14,11 +14,11 @@ class Split(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    camera: str = Field("front_camera", description="Camera whose held-out frames are the test set.")
-    every: int = Field(2, ge=1, description="One frame in this many trains.")
-    offset: int = Field(0, ge=0, description="Frame index of the first training frame.")
+    camera: str = Field(default="front_camera", description="Camera whose held-out frames are the test set.")
+    every: int = Field(default=2, ge=1, description="One frame in this many trains.")
+    offset: int = Field(default=0, ge=0, description="Frame index of the first training frame.")
     train_cameras: tuple[str, ...] = Field(
-        ("front_camera",), min_length=1, description="Cameras whose training frames are learned from."
+        default=("front_camera",), min_length=1, description="Cameras whose training frames are learned from."
     )
 
     @model_validator(mode="after")
