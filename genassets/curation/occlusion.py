@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 Outline = Literal["hull", "bounds"]
 
 
-def occluded_fractions(outlines: Sequence[Array], depths: ArrayLike, cells: int = 96) -> Array:
+def occluded_fractions(outlines: Sequence[Array], depths: ArrayLike, cells: int = 64) -> Array:
     """Fraction in [0, 1] of each outline's area that lies under the union of the nearer outlines.
 
     outlines: N convex polygons (K, 2) in pixels, in order around, of one image. depths: their distances; of
@@ -41,12 +41,13 @@ def occluded_fractions(outlines: Sequence[Array], depths: ArrayLike, cells: int 
             continue
         centres = _raster(bounds[index], cells)
         centres = centres[inside_convex(outline, centres)]
-        if len(centres) == 0:
-            continue
-        covered = np.zeros(len(centres), dtype=bool)
+        uncovered = centres
         for other in occluders.tolist():
-            covered |= inside_convex(outlines[other], centres)
-        result[index] = covered.mean()
+            if len(uncovered) == 0:
+                break
+            uncovered = uncovered[~inside_convex(outlines[other], uncovered)]
+        if len(centres):
+            result[index] = 1.0 - len(uncovered) / len(centres)
     return result
 
 
@@ -82,11 +83,13 @@ def inside_convex(outline: Array, points: Array) -> NDArray[np.bool_]:
     """Which points (N, 2) lie in a convex polygon (K, 2) given in either turning direction."""
     if len(outline) < 3:
         return np.zeros(len(points), dtype=bool)
-    edges = np.roll(outline, -1, axis=0) - outline
-    area = np.sum(outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1])
-    relative = points[:, None, :] - outline[None]
-    side = edges[None, :, 0] * relative[..., 1] - edges[None, :, 1] * relative[..., 0]
-    return np.all(side * (1.0 if area >= 0 else -1.0) >= 0, axis=1)
+    following = np.roll(outline, -1, axis=0)
+    area = np.sum(outline[:, 0] * following[:, 1] - following[:, 0] * outline[:, 1])
+    turn = 1.0 if area >= 0 else -1.0
+    # Each edge is the half plane normal . p >= offset; one product answers all of them.
+    normals = turn * np.stack([outline[:, 1] - following[:, 1], following[:, 0] - outline[:, 0]])
+    offsets = np.sum(normals.T * outline, axis=1)
+    return np.asarray((points @ normals >= offsets).all(axis=1))
 
 
 def _raster(bounds: Array, cells: int) -> Array:

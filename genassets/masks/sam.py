@@ -24,7 +24,9 @@ from genassets.masks.segmenter import Prompt
 
 PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)  # ImageNet's, RGB 0..255, as in SAM
 PIXEL_STD = np.array([58.395, 57.12, 57.375], dtype=np.float32)
-BOX_LABELS = np.array([[2.0, 3.0]], dtype=np.float32)
+BOX_CORNERS = [2.0, 3.0]  # the labels that SAM gives points
+ON_OBJECT = 1.0
+ELSEWHERE = 0.0
 DECODER_INPUTS = (
     "image_embeddings",
     "point_coords",
@@ -55,11 +57,15 @@ class SamSegmenter:
         label: str = "sam",
         crops: CropSettings | None = None,
         bounds_padding: float = 0.05,
+        actor_points: int = 0,
+        other_points: int = 0,
         threads: int | None = None,
     ) -> None:
         self.name = label
         self._crops = crops or CropSettings()
         self._bounds_padding = bounds_padding
+        self._actor_points = actor_points
+        self._other_points = other_points
         threads = threads or os.cpu_count() or 1
         self._encoder = _open_model(encoder_path, threads)
         self._decoder = _open_model(decoder_path, threads)
@@ -77,7 +83,7 @@ class SamSegmenter:
             for placement in placements:
                 x0, y0, x1, y1 = placement.crop.region
                 for index in placement.crop.prompts:
-                    logits = self._decode(embedding, placement, boxes[index])
+                    logits = self._decode(embedding, placement, prompts[index])
                     allowed = _widened(boxes[index], self._bounds_padding, width, height)
                     found = masks[index]
                     found[y0:y1, x0:x1] = logits > 0
@@ -102,20 +108,24 @@ class SamSegmenter:
         return embedding
 
     def _decode(
-        self, embedding: NDArray[np.float32], placement: Placement, bounds: tuple[float, float, float, float]
+        self, embedding: NDArray[np.float32], placement: Placement, prompt: Prompt
     ) -> NDArray[np.float32]:
         """Mask logits (h, w) of one box over its crop."""
         x0, y0, x1, y1 = placement.crop.region
         scale = placement.scale
         offset = np.array([placement.x, placement.y], dtype=np.float64)
-        corners = (np.array(bounds, dtype=np.float64).reshape(2, 2) - [x0, y0]) * scale + offset
+        corners = np.array(prompt.bounds, dtype=np.float64).reshape(2, 2)
+        on_actor = spread_points(prompt.on_actor, self._actor_points)
+        others = spread_points(prompt.in_front, self._other_points)
+        points = (np.concatenate([corners, on_actor, others]) - [x0, y0]) * scale + offset
+        labels = BOX_CORNERS + [ON_OBJECT] * len(on_actor) + [ELSEWHERE] * len(others)
         low: NDArray[np.float32] = self._decoder.run(
             [LOW_RESOLUTION],
             {
                 "image_embeddings": embedding,
                 # SAM counts pixel centres from 0 and adds 0.5 itself; ours are continuous.
-                "point_coords": (corners - 0.5).astype(np.float32)[None],
-                "point_labels": BOX_LABELS,
+                "point_coords": (points - 0.5).astype(np.float32)[None],
+                "point_labels": np.array([labels], np.float32),
                 "mask_input": np.zeros((1, 1, 256, 256), np.float32),
                 "has_mask_input": np.zeros(1, np.float32),
                 "orig_im_size": np.array([256, 256], np.float32),
@@ -134,6 +144,14 @@ class SamSegmenter:
             borderMode=cv2.BORDER_REPLICATE,
         )
         return np.asarray(logits, dtype=np.float32)
+
+
+def spread_points(pixels: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """At most `count` of pixels (N, 2), spread from left to right, each the median row of its share."""
+    ordered = pixels[np.argsort(pixels[:, 0], kind="stable")]
+    shares = [share for share in np.array_split(ordered, count) if len(share)] if count else []
+    chosen = [share[np.argsort(share[:, 1], kind="stable")[len(share) // 2]] for share in shares]
+    return np.array(chosen, dtype=np.float64).reshape(-1, 2)
 
 
 def _open_model(path: Path, threads: int) -> Any:

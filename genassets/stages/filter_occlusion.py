@@ -85,10 +85,9 @@ def run(inputs: Inputs, config: FilterOcclusionConfig, out: Path, context: Stage
 
 def _with_images(log: Log, rows: pd.DataFrame) -> Iterator[tuple[Any, NDArray[np.uint8], Intrinsics]]:
     """Rows with their image and its camera; each image is read once."""
-    images = rows.groupby(["camera", "frame"], sort=False)
-    for (camera, frame), group in images:  # type: ignore[misc]  # pandas-stubs type keys as Hashable
-        stream = log.cameras[camera]
-        image = stream.image(int(frame))
+    for _, group in rows.groupby(["camera", "frame"], sort=False):
+        stream = log.cameras[group["camera"].iloc[0]]
+        image = stream.image(group["frame"].iloc[0])
         for row in group.itertuples(index=False):
             yield row, image, stream.intrinsics
 

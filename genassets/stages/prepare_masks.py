@@ -29,7 +29,7 @@ class PrepareMasksConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    split: Split = Field(default_factory=Split)
+    split: Split = Split()
     cameras: tuple[str, ...] | None = Field(
         None, description="Cameras that get masks; none: those of the split, for training and for testing."
     )
@@ -46,6 +46,13 @@ class PrepareMasksConfig(BaseModel):
         1.0, ge=0, le=1, description="Boxes with more of their extent outside the image get no mask."
     )
     max_depth: float | None = Field(None, gt=0, description="Boxes farther than this get no mask (metres).")
+    max_occluded: float | None = Field(
+        0.5,
+        ge=0,
+        le=1,
+        description="Boxes with more of their area under nearer boxes get no mask, because filter_occlusion "
+        "would drop them; none: mask them all.",
+    )
     segmenter: Literal["auto", "sam", "grabcut"] = Field(
         "auto", description="auto: the SAM-style files where they are verified, else GrabCut by its own name."
     )
@@ -76,6 +83,7 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
     from genassets.curation.mask_request import MaskRequest
     from genassets.curation.object_table import write_object_table
     from genassets.curation.observations import actor_returns, observe
+    from genassets.curation.occlusion import occluded_fractions
     from genassets.driving import anchor_tracks
     from genassets.driving.synthetic.truth import open_truth
     from genassets.masks.crops import CropSettings
@@ -93,6 +101,7 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
         scale_with_image=config.scale_with_image,
         max_truncation=config.max_truncation,
         max_depth=config.max_depth,
+        max_occluded=config.max_occluded,
     )
     segmenter = choose_segmenter(
         config.segmenter,
@@ -110,9 +119,13 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
                 continue
             observations = observe(log, camera, frame, returns)
             found = [observation.row(log) for observation in observations]
+            occluded = occluded_fractions(
+                [observation.outline for observation in observations],
+                [observation.projection.depth for observation in observations],
+            )
             wanted = []
-            for row, observation in zip(found, observations, strict=True):
-                row["reason"] = request.refusal(row)
+            for row, observation, fraction in zip(found, observations, occluded, strict=True):
+                row["reason"] = request.refusal(row, float(fraction))
                 if row["reason"] is None:
                     wanted.append((row, observation))
             if wanted:
