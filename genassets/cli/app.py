@@ -20,6 +20,7 @@ from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
 from genassets.cli.list import list_runs
 from genassets.cli.plan import plan
+from genassets.cli.report import report
 from genassets.cli.resume import resume
 from genassets.cli.run import run
 from genassets.cli.schema import schema
@@ -66,6 +67,7 @@ app.command("plan")(plan)
 app.command("status")(status)
 app.command("explain")(explain)
 app.command("resume")(resume)
+app.command("report")(report)
 app.command("list")(list_runs)
 app.command("verify")(verify)
 app.command("schema")(schema)

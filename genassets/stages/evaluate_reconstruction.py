@@ -58,7 +58,7 @@ def run(
     from genassets.evaluation.viewpoint import ViewThresholds
     from genassets.export.picture_list import PictureList
     from genassets.reconstruction.scene_renderer import SceneRenderer
-    from genassets.stages.ingest import open_ingested
+    from genassets.stages.ingested import open_ingested
     from genassets.weights import load_lpips_arrays
 
     renderer = SceneRenderer.load(inputs.one("reconstruct"))
@@ -71,10 +71,10 @@ def run(
     skipped: list[Skipped] = []
     training: list[Observation] = []
     held_out: list[Observation] = []
-    tables = inputs.shards("filter_occlusion")
-    for index, (shard, ingested) in enumerate(inputs.shards("ingest").items()):
-        log = open_ingested(ingested)
-        log_training, log_held_out = _observations(tables[shard], config.split)
+    tables, logs = inputs.shards("filter_occlusion"), inputs.shards("ingest")
+    for index, (shard, table_path) in enumerate(tables.items()):
+        log = open_ingested(logs[shard])
+        log_training, log_held_out = _observations(table_path, config.split)
         library = frozenset(renderer.assets.loc[renderer.assets["log"] == log.name, "actor_id"])
 
         def report(done: int, total: int, index: int = index, name: str = log.name) -> None:
@@ -100,7 +100,7 @@ def run(
     return [Metric(*mean) for mean in means(observations)] + _counts(scored, skipped)
 
 
-def _observations(table: Path, split: Split) -> tuple[list[Observation], list[Observation]]:
+def _observations(path: Path, split: Split) -> tuple[list[Observation], list[Observation]]:
     """Kept observations of the training frames and of the held-out frames."""
     from genassets.curation.object_table import (
         bounds_of,
@@ -111,7 +111,7 @@ def _observations(table: Path, split: Split) -> tuple[list[Observation], list[Ob
     from genassets.evaluation.sparse_view import Observation
     from genassets.evaluation.viewpoint import viewpoint_of
 
-    rows = read_object_table(table / "objects.parquet")
+    rows = read_object_table(path / "objects.parquet")
     training: list[Observation] = []
     held_out: list[Observation] = []
     for row in rows[rows["kept"]].itertuples(index=False):

@@ -1,0 +1,58 @@
+"""Curves of a stage as one SVG picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+Curve = tuple[str, NDArray[np.int64], NDArray[np.float64]]
+"""Name, steps and values."""
+
+COLUMNS = 3
+LOG_RANGE = 50.0
+"""A curve of positive values that spans more than this factor is drawn on a logarithmic axis."""
+
+
+def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
+    """Draw every curve in its own small plot: the points pale, their running mean dark. Raises ValueError
+    without curves.
+    """
+    if not curves:
+        raise ValueError(f"{path}: no curve to draw")
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    columns = min(COLUMNS, len(curves))
+    lines = -(-len(curves) // columns)
+    style = {"svg.fonttype": "none", "svg.hashsalt": path.stem, "font.size": 9, "font.family": "sans-serif"}
+    with rc_context(style):
+        figure = Figure(figsize=(3.6 * columns, 2.3 * lines), layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.subplots(lines, columns, squeeze=False).ravel()
+        for axis, (name, steps, values) in zip(axes, curves, strict=False):
+            axis.plot(steps, values, color="#9db7d5", linewidth=0.8)
+            if len(values) >= 20:
+                axis.plot(steps, running_mean(values, len(values) // 20), color="#1f4e8c", linewidth=1.4)
+            if values.min() > 0 and values.max() / values.min() > LOG_RANGE:
+                axis.set_yscale("log")
+            axis.set_title(name, fontsize=9, loc="left")
+            axis.set_xlabel("step", fontsize=8)
+            axis.grid(color="#e3e6ea", linewidth=0.6)
+            axis.spines[["top", "right"]].set_visible(False)
+        for axis in axes[len(curves) :]:
+            axis.set_visible(False)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        # Without metadata the same curves give the same bytes.
+        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None})
+
+
+def running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+    """Mean over the last `width` values and the value itself; at the start over what there is."""
+    total = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
+    end = np.arange(1, len(values) + 1)
+    start = np.maximum(0, end - width - 1)
+    return np.asarray((total[end] - total[start]) / (end - start))

@@ -1,0 +1,177 @@
+"""Tidy metric rows as tables for people: one column a measure, one row a setting and method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+MetricRow = Mapping[str, Any]
+"""setting, split, class, metric, value, n, method."""
+
+HIGHER_IS_BETTER = ("psnr", "ssim", "iou", "f_score", "watertight", "largest_part")
+LOWER_IS_BETTER = ("lpips", "chamfer", "extent_error", "fid", "kid")
+DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3}
+PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One value as text; `best` among the rows that it competes with."""
+
+    text: str
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """Labels and cells of one line; `first` starts a group of lines that compete."""
+
+    labels: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    first: bool
+
+
+@dataclass(frozen=True)
+class MetricTable:
+    """A table with its headings; `notes` say how the measures were made."""
+
+    title: str
+    headings: tuple[str, ...]
+    measures: tuple[str, ...]
+    rows: tuple[TableRow, ...]
+    notes: tuple[str, ...]
+    folded: bool = False
+
+
+def stage_tables(stage: str, rows: Sequence[MetricRow]) -> list[MetricTable]:
+    """The tables of one stage's metrics."""
+    if stage == "evaluate_reconstruction":
+        return _evaluation_tables(rows)
+    overall = [row for row in rows if row["class"] == "all"]
+    by_class = [row for row in rows if row["class"] != "all"]
+    tables = [
+        metric_table("All classes", overall, ("setting", "split", "method")),
+        metric_table(
+            "By class", by_class, ("setting", "split", "class", "method"), folded=len(by_class) > 40
+        ),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
+    """The sparse-view evaluation: the model beside its baselines by group, class and log, then gains and
+    counts.
+    """
+    gains = [row for row in rows if row["metric"].endswith("_gain")]
+    counts = [row for row in rows if row["method"].startswith("count")]
+    means = [row for row in rows if row not in gains and row not in counts]
+    overall = [row for row in means if row["class"] == "all" and row["split"] == "test"]
+    by_class = [row for row in means if row["class"] != "all" and row["setting"] == "sparse_view/all"]
+    by_log = [row for row in means if row["split"] != "test" and row["setting"] == "sparse_view/all"]
+    gain_rows = [row for row in gains if row["class"] == "all" and row["split"] == "test"]
+    details = [
+        row
+        for row in means
+        if (row["class"] != "all" or row["split"] != "test") and row["setting"] != "sparse_view/all"
+    ]
+    tables = [
+        metric_table("By viewpoint group", overall, ("setting", "method")),
+        metric_table(
+            "What the model gains over the baselines", gain_rows, ("setting", "method"), compete=False
+        ),
+        metric_table("By class, moved and same together", by_class, ("class", "method")),
+        metric_table("By log, moved and same together", by_log, ("split", "method")),
+        metric_table("Observations and actors", counts, ("setting",), compete=False),
+        metric_table(
+            "By group, class and log", details, ("setting", "split", "class", "method"), folded=True
+        ),
+    ]
+    return [table for table in tables if table.rows]
+
+
+def metric_table(
+    title: str, rows: Iterable[MetricRow], labels: tuple[str, ...], compete: bool = True, folded: bool = False
+) -> MetricTable:
+    """Pivot tidy rows: a line for each combination of `labels`, a column for each measure, and n.
+
+    The method's part before the first semicolon is the label "method", the rest becomes a note. Lines that
+    differ in the method alone compete for the best value of a measure whose better direction is known.
+    """
+    lines: dict[tuple[str, ...], dict[str, MetricRow]] = {}
+    notes: dict[str, list[str]] = {}
+    for row in rows:
+        who, _, how = row["method"].partition(";")
+        key = tuple(who if label == "method" else str(row[label]) for label in labels)
+        lines.setdefault(key, {})[row["metric"]] = row
+        if how.strip() and how.strip() not in notes.setdefault(row["metric"], []):
+            notes[row["metric"]].append(how.strip())
+    measures = tuple(dict.fromkeys(measure for line in lines.values() for measure in line))
+    ordered = sorted(lines, key=lambda key: (_group_rank(key, lines), _predictor_rank(key[-1])))
+    best = _best_values(lines, measures) if compete and labels[-1] == "method" else {}
+    table_rows = []
+    previous: tuple[str, ...] | None = None
+    for key in ordered:
+        line = lines[key]
+        group = key[:-1] if labels[-1] == "method" else ()
+        cells = [
+            Cell(format_value(measure, line[measure]["value"]), best.get((group, measure)) == key)
+            if measure in line
+            else Cell("")
+            for measure in measures
+        ]
+        sizes = sorted({int(row["n"]) for row in line.values()})
+        cells.append(Cell(f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"))
+        table_rows.append(TableRow(key, tuple(cells), first=group != previous))
+        previous = group
+    written = tuple(f"{measure}: {'; '.join(texts)}" for measure, texts in notes.items())
+    return MetricTable(title, labels, (*measures, "n"), tuple(table_rows), written, folded)
+
+
+def format_value(measure: str, value: float) -> str:
+    """A value as text, with the decimals that its measure deserves."""
+    if not math.isfinite(value):
+        return str(value)
+    sign = "+" if measure.endswith("_gain") and value >= 0 else ""
+    for name, decimals in DECIMALS.items():
+        if name in measure:
+            return f"{sign}{value:.{decimals}f}"
+    if float(value).is_integer() and abs(value) < 1e15:
+        return f"{int(value):,}"
+    return f"{sign}{value:.4g}"
+
+
+def _best_values(
+    lines: Mapping[tuple[str, ...], Mapping[str, MetricRow]], measures: Sequence[str]
+) -> dict[tuple[tuple[str, ...], str], tuple[str, ...]]:
+    """Which line of each group is best in each measure; groups of one line have no best."""
+    groups: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for key in lines:
+        groups.setdefault(key[:-1], []).append(key)
+    best = {}
+    for group, keys in groups.items():
+        for measure in measures:
+            direction = _direction(measure)
+            competing = [key for key in keys if measure in lines[key]]
+            if direction and len(competing) > 1:
+                best[group, measure] = max(
+                    competing, key=lambda key: direction * float(lines[key][measure]["value"])
+                )
+    return best
+
+
+def _direction(measure: str) -> int:
+    if any(name in measure for name in LOWER_IS_BETTER):
+        return -1
+    return int(any(name in measure for name in HIGHER_IS_BETTER))
+
+
+def _group_rank(key: tuple[str, ...], lines: Mapping[tuple[str, ...], object]) -> int:
+    """Groups keep the order in which they first appear."""
+    groups = list(dict.fromkeys(other[:-1] for other in lines)) if len(key) > 1 else [key]
+    return groups.index(key[:-1]) if len(key) > 1 else 0
+
+
+def _predictor_rank(name: str) -> int:
+    return PREDICTOR_ORDER.index(name) if name in PREDICTOR_ORDER else len(PREDICTOR_ORDER)
