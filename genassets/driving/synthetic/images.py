@@ -50,7 +50,7 @@ def render(
         directions = (in_camera @ rotation.T).astype(np.float32)
         origins = np.broadcast_to(origin, directions.shape)
         hits = city.cast(origins, directions)
-        radiance = shade(city, light, hits, origins, directions, footprints, beam)
+        radiance = shade(city, light, hits, origins, directions, footprints, beam, not cut_out)
         return develop(light, radiance), hits.distance, hits.triangle, in_camera[:, 2]
 
     rgb, distance, triangle, axial = trace(centres)

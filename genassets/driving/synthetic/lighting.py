@@ -130,17 +130,25 @@ def shade(
     directions: F32,
     footprints: Footprints | None = None,
     beam: Beam | None = None,
+    backdrop: bool = True,
 ) -> F32:
-    """Radiance (N, 3) that comes back along N rays: hits' surfaces where there are any, else the sky."""
-    radiance = sky(light, directions)
+    """Radiance (N, 3) that comes back along N rays: hits' surfaces where there are any, else the sky.
+
+    Without `backdrop` rays that hit nothing get 0.
+    """
+    radiance = np.zeros((len(directions), 3), dtype=np.float32)
+    if backdrop:
+        missed = np.flatnonzero(hits.triangle < 0)
+        radiance[missed] = sky(light, directions[missed])
     rows = np.flatnonzero(hits.triangle >= 0)
     if not len(rows):
         return radiance
     seen = Hits(hits.distance[rows], hits.triangle[rows], hits.uv[rows])
     ray = directions[rows]
     normal = city.normals(seen)
-    facing = (normal * ray).sum(1, keepdims=True)
+    facing = np.einsum("nc,nc->n", normal, ray)[:, None]
     normal = np.where(facing > 0, -normal, normal)
+    facing = np.abs(facing)
     points = origins[rows] + seen.distance[:, None] * ray
     surfaces = city.surfaces
     kind = surfaces.kinds[seen.triangle]
@@ -148,7 +156,8 @@ def shade(
     glow = surfaces.glow[seen.triangle]
 
     flat = (normal[:, 2] > 0.95) & (points[:, 2] < 0.3) & (kind == Kind.MATTE)
-    albedo = np.where(flat[:, None], albedo * _ground_grain(light, points, seen.distance)[:, None], albedo)
+    ground = np.flatnonzero(flat)
+    albedo[ground] *= _ground_grain(light, points[ground], seen.distance[ground])[:, None]
 
     openness = 0.55 + 0.45 * normal[:, 2]
     # Walls see less sky near the street; the ground sees none under cars.
@@ -157,11 +166,11 @@ def shade(
     )
     if footprints is not None:
         openness = openness * _contact_shade(points, flat, footprints)
-    ambient = (0.5 * light.zenith + 0.5 * light.horizon) * 0.62
-    bounce = light.horizon * 0.10 + light.sun * 0.05
+    ambient = (0.35 * light.zenith + 0.65 * light.horizon) * 0.80
+    bounce = light.horizon * 0.14 + light.sun * 0.08
     incoming = openness[:, None] * ambient + (0.5 - 0.5 * normal[:, 2:3]) * bounce
     highlight = np.zeros_like(albedo)
-    reflected = ray - 2 * (ray * normal).sum(1, keepdims=True) * normal
+    reflected = ray + 2 * facing * normal
     if light.night:
         _add_lamps(city, light, points, normal, incoming, openness)
         if beam is not None:
