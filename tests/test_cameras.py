@@ -35,7 +35,7 @@ def test_pixels_and_rays_are_each_others_inverse() -> None:
 
 
 def test_resizing_and_cropping_keep_the_view() -> None:
-    """A point at (30, 20) of 100 x 80 is at (60, 40) of 200 x 160, and at (5, 10) of the crop from (25, 10)."""
+    """A point at (30, 20) of 100 x 80 is at (60, 40) of 200 x 160 and (5, 10) of the crop from (25, 10)."""
     point = pixel_directions(CAMERA, [[30.0, 20.0]])
     np.testing.assert_allclose(project(CAMERA.resized(200, 160), point), [[60, 40]])
     crop = CAMERA.cropped(25, 10, 65, 50)
@@ -68,7 +68,7 @@ def test_box_behind_or_beside_the_view_is_nothing() -> None:
 
 
 def test_box_straddling_the_camera_plane_is_cut_and_not_mirrored() -> None:
-    """A box beside the camera, x 1..3 m, z -4..4: visible from where x / z enters the image, to the right edge.
+    """A box beside the camera, x 1..3 m, z -4..4: visible from where x / z enters to the right edge.
 
     At the far end z = 4 its inner side is at 50 + 100 / 4 = 75 px; nothing may appear left of that.
     """

@@ -105,7 +105,7 @@ def test_interpolation_without_poses_is_refused() -> None:
 
 
 def test_turntable_shows_the_front_then_the_left_side() -> None:
-    """From the front the actor's left is on the right of the image; from its left, its front is on the left."""
+    """From the front the actor's left is on the image's right; from its left, its front is on the left."""
     size = (4.5, 1.9, 1.6)
     front, left = [0.9, 0.0, 0.0], [0.0, 0.9, 0.0]
     for azimuth, point, side in ((0, left, 1), (90, front, -1), (180, left, -1), (270, front, 1)):

@@ -22,9 +22,11 @@ from genassets.errors import LogError
 from genassets.geometry.transforms import invert_pose, transform_points, yaw_pose
 
 SPIN_SECONDS = 0.1  # the spinning LiDAR turns at 10 Hz
-SIZE_QUANTILE = (
-    0.9  # annotators' sizes jitter along a track: a high quantile is a maximum without the outliers
-)
+# lidar/poses.json has its origin 0.4 m above the road, and the spinning LiDAR stands this far in front of
+# it, in metres: fitted to the stamps and bearings of sequence 002's points (0.75 m while the car stands).
+SPIN_AXIS_FORWARD = 0.75
+# Annotators' sizes jitter along a track: a high quantile is a maximum without the outliers.
+SIZE_QUANTILE = 0.9
 
 _NUMBERS = ("yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z")
 _REQUIRED = ("uuid", "label", "stationary", *_NUMBERS)
@@ -172,12 +174,12 @@ def join_tracks(
 def spin_offset(world_from_lidar: NDArray[np.float64], point: tuple[float, float, float]) -> float:
     """Seconds, in (-0.1, 0], from a sweep's stamp to the moment the spinning LiDAR looked at a world point.
 
-    The LiDAR turns clockwise and its stamp is when it looks to the rear (its -y): measured on sequence 002,
-    where the stamps of its points follow this to within 1.5 ms, and the cameras' stamps too (front -50 ms,
-    back -100 ms).
+    The LiDAR turns clockwise and its stamp is when it looks to the rear (its -y). Measured on sequence 002,
+    where the stamps of its points follow this to 2 ms (each beam has a bearing of its own) and so do the
+    cameras' (front -50 ms, back -100 ms).
     """
     x, y, _ = transform_points(invert_pose(world_from_lidar), point)
-    turned = np.arctan2(y, x) + np.pi / 2
+    turned = np.arctan2(y - SPIN_AXIS_FORWARD, x) + np.pi / 2
     return -SPIN_SECONDS * float(turned % (2 * np.pi)) / (2 * np.pi)
 
 

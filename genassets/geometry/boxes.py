@@ -50,7 +50,8 @@ def points_in_box(
     inside = np.zeros(len(points), dtype=bool)
     # Most points of a sweep are far away: the world-aligned bounds drop them before the rotation.
     reach = np.abs(pose[:3, :3]) @ half + 1e-9
-    near = np.flatnonzero(np.all(np.abs(points - pose[:3, 3]) <= reach, axis=1))
+    near = np.flatnonzero(np.abs(points[:, 0] - pose[0, 3]) <= reach[0])
+    near = near[np.abs(points[near, 1] - pose[1, 3]) <= reach[1]]
     local = transform_points(invert_pose(pose), points[near])
     inside[near] = np.all(np.abs(local) <= half, axis=1)
     return inside
