@@ -17,6 +17,7 @@ from genassets import __version__
 from genassets.cli import weights
 from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
+from genassets.cli.inspect import inspect
 from genassets.cli.explain import explain
 from genassets.cli.list import list_runs
 from genassets.cli.plan import plan
@@ -73,6 +74,7 @@ app.command("verify")(verify)
 app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
+app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")
 
 
