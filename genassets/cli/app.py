@@ -17,8 +17,8 @@ from genassets import __version__
 from genassets.cli import weights
 from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
-from genassets.cli.inspect import inspect
 from genassets.cli.explain import explain
+from genassets.cli.inspect import inspect
 from genassets.cli.list import list_runs
 from genassets.cli.plan import plan
 from genassets.cli.report import report
