@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from genassets.driving.cuboids import SPIN_SECONDS
 from genassets.driving.log import Log, Track
-from genassets.driving.sweep import SPINNING, Sweep
+from genassets.driving.sweep import FORWARD, SPINNING, Sweep
 from genassets.geometry.boxes import points_in_box
 
 ANCHOR_POINTS = 5  # fewer points than this give no reliable median
@@ -69,9 +70,10 @@ def count_actor_points(sweep: Sweep, tracks: Sequence[Track], frame: int) -> NDA
 def anchor_tracks(log: Log) -> Log:
     """The log with moving actors' poses dated by the LiDAR points inside them; reads every sweep once.
 
-    A pose is taken to hold at the median time of the points in its box. With fewer than ANCHOR_POINTS of
-    them, or where the times would not increase, the time from opening stays (the spinning LiDAR's look in
-    that direction).
+    A pose is taken to hold at the median time of the points in its box. The time from opening stays (the
+    spinning LiDAR's look in that direction) with fewer than ANCHOR_POINTS of them, with points from both ends
+    of the turn (an actor behind the car, whose median would lie in neither), and where the times would not
+    increase.
     """
     times = {track.actor_id: track.times.copy() for track in log.tracks if not track.stationary}
     for frame in range(log.frame_count):
@@ -81,10 +83,11 @@ def anchor_tracks(log: Log) -> Log:
         for track in log.tracks:
             if track.stationary or not track.covers(frame):
                 continue
-            inside = actor_mask(sweep, track, frame)
-            if np.count_nonzero(inside) >= ANCHOR_POINTS:
+            seen = sweep.times[actor_mask(sweep, track, frame)]
+            both_ends = track.sensor != FORWARD and len(seen) and np.ptp(seen) > SPIN_SECONDS / 2
+            if len(seen) >= ANCHOR_POINTS and not both_ends:
                 row = int(np.flatnonzero(track.frames == frame)[0])
-                times[track.actor_id][row] = np.median(sweep.times[inside])
+                times[track.actor_id][row] = np.median(seen)
     anchored = [
         replace(track, times=times[track.actor_id])
         if track.actor_id in times and np.all(np.diff(times[track.actor_id]) > 0)
