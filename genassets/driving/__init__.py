@@ -11,6 +11,7 @@ from genassets.driving.actor_points import (
 from genassets.driving.classes import CAMERA_NAMES, CLASSES, NIGHT_LOGS, VEHICLE_CLASSES, class_of
 from genassets.driving.log import CameraStream, Log, Sweep, Track
 from genassets.driving.pandaset import open_log
+from genassets.driving.pandaset_writer import PandasetWriter, write_pandaset
 
 __all__ = [
     "CAMERA_NAMES",
@@ -19,6 +20,7 @@ __all__ = [
     "VEHICLE_CLASSES",
     "CameraStream",
     "Log",
+    "PandasetWriter",
     "Sweep",
     "Track",
     "actor_mask",
@@ -27,4 +29,5 @@ __all__ = [
     "class_of",
     "count_actor_points",
     "open_log",
+    "write_pandaset",
 ]
