@@ -126,12 +126,12 @@ def populate(
     for number, actor_class in enumerate(_draw_classes(spec, rng)):
         model = draw_model(actor_class, rng)
         share = moving_left / max(spec.vehicles - number, 1)
-        if spec.moving_share > 0 and (actor_class in ALWAYS_MOVING or rng.random() < share):
-            if actor_class not in ALWAYS_PARKED:
-                moving_left -= 1
-                place(model, lambda m=model: (_lane_path(m, layout, duration, span, rng), 0.0))  # type: ignore[misc]
-                continue
-        place(model, lambda m=model: (_kerb_path(m, layout, spec, rng), 0.0))  # type: ignore[misc]
+        drives = actor_class in ALWAYS_MOVING or (actor_class not in ALWAYS_PARKED and rng.random() < share)
+        if spec.moving_share > 0 and drives:
+            moving_left -= 1
+            place(model, lambda m=model: (_lane_path(m, layout, duration, span, rng), 0.0))  # type: ignore[misc]
+        else:
+            place(model, lambda m=model: (_kerb_path(m, layout, spec, rng), 0.0))  # type: ignore[misc]
     for _ in range(spec.pedestrians):
         model = draw_model("Pedestrian", rng)
         place(model, lambda: _sidewalk_path(layout, span, rng))
@@ -140,9 +140,9 @@ def populate(
 
 def _draw_classes(spec: CitySpec, rng: np.random.Generator) -> list[str]:
     """Classes of the vehicles, one of each first (the long ones, which need room), then by frequency."""
-    shares = [(name, share) for name, share in OTHER_SHARES if name in spec.classes]
+    shares: list[tuple[str, float]] = [(name, share) for name, share in OTHER_SHARES if name in spec.classes]
     order = ("Bus", "Construction Vehicle", "Emergency Vehicle", "Truck", "Motorcycle", "Bicycle", "Car")
-    required = [name for name in order if name in dict(shares)][: spec.vehicles]
+    required: list[str] = [name for name in order if name in dict(shares)][: spec.vehicles]
     weights = np.array([share for _, share in shares])
     if not len(weights):
         return []
@@ -206,7 +206,9 @@ def _lane_path(
     return straight((x, start), heading, speed, span)
 
 
-def _sidewalk_path(layout: CityLayout, span: tuple[float, float], rng: np.random.Generator) -> tuple[Path, float]:
+def _sidewalk_path(
+    layout: CityLayout, span: tuple[float, float], rng: np.random.Generator
+) -> tuple[Path, float]:
     """A walk along a sidewalk, a wait at a corner, or a crossing on the stripes; and the height walked on."""
     cx = layout.crossing_x
     speed = float(rng.uniform(0.8, 1.6))
@@ -221,7 +223,10 @@ def _sidewalk_path(layout: CityLayout, span: tuple[float, float], rng: np.random
         return straight((x, start), heading, reach / span[1], span), 0.0
     if choice < 0.35:
         arm = 1.0 if rng.random() < 0.5 else -1.0
-        place = (cx + arm * (CROSS_HALF + float(rng.uniform(2.2, 3.2))), side * (STREET_HALF + float(rng.uniform(2.2, 3.2))))
+        place = (
+            cx + arm * (CROSS_HALF + float(rng.uniform(2.2, 3.2))),
+            side * (STREET_HALF + float(rng.uniform(2.2, 3.2))),
+        )
         return parked(place, float(rng.uniform(-np.pi, np.pi))), KERB_HEIGHT
     way = 1.0 if rng.random() < 0.5 else -1.0
     start_x = float(rng.uniform(-15.0, cx + 30.0))

@@ -8,15 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.driving.synthetic.cars import SHAPES, build_car, draw_car
+from genassets.driving.synthetic.car_shapes import SHAPES, draw_car
+from genassets.driving.synthetic.cars import build_car
+from genassets.driving.synthetic.emergency import build_ambulance, build_fire_engine, build_police
 from genassets.driving.synthetic.heavy import (
-    build_ambulance,
     build_box_truck,
     build_bus,
     build_excavator,
-    build_fire_engine,
     build_mixer,
-    build_police,
     build_semi,
 )
 from genassets.driving.synthetic.mesh import Mesh

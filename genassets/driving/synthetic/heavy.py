@@ -1,9 +1,10 @@
-"""Trucks, buses, construction and emergency vehicles, built of box-shaped bodies on a chassis."""
+"""Trucks, buses and construction vehicles, built of box-shaped bodies on a chassis."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,12 +20,12 @@ from genassets.driving.synthetic.bodywork import (
     arch_height,
     arch_stations,
 )
-from genassets.driving.synthetic.cars import build_car, draw_car
 from genassets.driving.synthetic.materials import (
     CHROME,
     DARK_GLASS,
     GRILLE,
     LAMP_AMBER,
+    LAMP_CLEAR,
     RIM,
     TRIM,
     TYRE,
@@ -32,7 +33,7 @@ from genassets.driving.synthetic.materials import (
     draw_paint,
     linear,
 )
-from genassets.driving.synthetic.mesh import Look, Mesh, MeshBuilder, add_box, add_ellipsoid, add_tube
+from genassets.driving.synthetic.mesh import Look, Mesh, MeshBuilder, add_box, add_tube
 
 GLASS: Look = (DARK_GLASS, Kind.GLASS)
 DARK: Look = (TRIM, Kind.MATTE)
@@ -67,7 +68,9 @@ def add_body(builder: MeshBuilder, body: Body, wheels: Sequence[Wheel]) -> None:
     own = [w for w in wheels if body.x_rear - w.radius < w.x < body.x_front + w.radius]
     ends = np.array([0.0, 0.04, 0.12, 0.25])
     extra = arch_stations(own, 0.09) if own else np.zeros(0)
-    x = np.concatenate([np.linspace(body.x_rear, body.x_front, 7), body.x_rear + ends, body.x_front - ends, extra])
+    x = np.concatenate(
+        [np.linspace(body.x_rear, body.x_front, 7), body.x_rear + ends, body.x_front - ends, extra]
+    )
     x = np.concatenate([x, [edge for pane in body.panes for edge in pane]])
     x = np.unique(np.clip(x, body.x_rear, body.x_front).round(4))
     half = body.width / 2
@@ -76,7 +79,18 @@ def add_body(builder: MeshBuilder, body: Body, wheels: Sequence[Wheel]) -> None:
     bottom = np.maximum(body.floor, arch_height(x, own, 0.09))
     low, high = body.window
     sill = min(body.floor + 0.35, low - 0.1)
-    heights = [body.floor, body.floor, body.floor + 0.05, sill, low, high, body.roof - 0.14, body.roof - 0.03, body.roof, body.roof]
+    heights = [
+        body.floor,
+        body.floor,
+        body.floor + 0.05,
+        sill,
+        low,
+        high,
+        body.roof - 0.14,
+        body.roof - 0.03,
+        body.roof,
+        body.roof,
+    ]
     across = [0.0, 0.92, 1.0, 1.0, 1.0, 0.995, 0.98, 0.955, 0.85, 0.0]
     gaps = 0.004 * np.arange(len(heights))
     profiles = np.stack(
@@ -111,7 +125,10 @@ def add_body(builder: MeshBuilder, body: Body, wheels: Sequence[Wheel]) -> None:
     add_face(builder, body.x_rear, profiles[0], 0.0, False, rear)
 
 
-def _lights(builder: MeshBuilder, front: float, rear: float, half: float, z_front: float, z_rear: float) -> None:
+def add_lights(
+    builder: MeshBuilder, front: float, rear: float, half: float, z_front: float, z_rear: float
+) -> None:
+    """Add head and tail lamps at the outer edges of the front and rear faces."""
     add_lamp_pair(builder, front, half * 0.74, z_front, (0.08, 0.32, 0.2), Kind.HEADLAMP)
     add_lamp_pair(builder, rear, half * 0.84, z_rear, (0.06, 0.18, 0.3), Kind.TAILLAMP)
 
@@ -127,7 +144,7 @@ def build_bus(rng: np.random.Generator) -> Mesh:
     stripe: Look = (linear(colours[int(rng.integers(len(colours)))]), Kind.PAINT)
     count = int(length / 1.5)
     edges = np.linspace(-front + 0.5, front - 0.35, count + 1)
-    panes = tuple((float(a) + 0.06, float(b) - 0.06) for a, b in zip(edges[:-1], edges[1:], strict=True))
+    panes = tuple((float(a) + 0.06, float(b) - 0.06) for a, b in pairwise(edges))
     body = Body(-front, front, width, 0.32, height, (1.15, 2.45), panes, paint, stripe, 0.25, True, True)
     add_body(builder, body, wheels)
     add_wheels(builder, wheels)
@@ -137,13 +154,21 @@ def build_bus(rng: np.random.Generator) -> Mesh:
         add_box(builder, (x + 0.54, -width / 2 - 0.02, 0.42), (x + 0.61, -width / 2, 2.4), DARK)
     add_box(builder, (front + 0.05, -0.85, 2.55), (front + 0.1, 0.85, 2.85), (linear("19160c"), Kind.GLASS))
     add_box(builder, (-front + 1.0, -0.9, height - 0.02), (-front + 4.0, 0.9, height + 0.18), paint)
-    _lights(builder, front + 0.04, -front, width / 2, 0.72, 0.9)
+    add_lights(builder, front + 0.04, -front, width / 2, 0.72, 0.9)
     add_plates(builder, front + 0.1, -front - 0.01, 0.5, 0.7)
     add_mirrors(builder, front - 0.05, width / 2 + 0.02, 2.2, DARK, 2.0)
     return builder.build()
 
 
-def _add_cab(builder: MeshBuilder, front: float, length: float, width: float, height: float, wheels: Sequence[Wheel], paint: Look) -> None:
+def _add_cab(
+    builder: MeshBuilder,
+    front: float,
+    length: float,
+    width: float,
+    height: float,
+    wheels: Sequence[Wheel],
+    paint: Look,
+) -> None:
     """A cab-over cab whose front is at `front`."""
     panes = ((front - 0.85, front - 0.12),)
     window = (0.52 * height + 0.15, height - 0.3)
@@ -160,16 +185,26 @@ def build_box_truck(rng: np.random.Generator, paint: Look | None = None, box: Lo
     builder = MeshBuilder()
     length, width = float(rng.uniform(5.8, 7.6)), float(rng.uniform(2.15, 2.4))
     front, cab_height, top = length / 2, float(rng.uniform(2.2, 2.5)), float(rng.uniform(2.9, 3.5))
-    wheels = [Wheel(front - 0.95, 0.42, 0.26, width / 2 - 0.04), Wheel(-front + 1.5, 0.42, 0.5, width / 2 - 0.02)]
+    wheels = [
+        Wheel(front - 0.95, 0.42, 0.26, width / 2 - 0.04),
+        Wheel(-front + 1.5, 0.42, 0.5, width / 2 - 0.02),
+    ]
     cab: Look = paint or (draw_paint(rng), Kind.PAINT)
     colours = ("e8e8e4", "e8e8e4", "d8d4c8", "c94b25", "33538a", "d3ad2f")
     cargo: Look = box or (linear(colours[int(rng.integers(len(colours)))]), Kind.PAINT)
     _add_cab(builder, front, 1.75, width - 0.1, cab_height, wheels, cab)
     rear = -front
     add_box(builder, (rear + 0.1, -0.45, 0.5), (front - 0.3, 0.45, 0.95), DARK)
-    body = Body(rear, front - 1.9, width, 0.92, top, (1.5, 1.9), (), cargo, cargo if box is None else RED, 0.0, False)
+    body = Body(
+        rear, front - 1.9, width, 0.92, top, (1.5, 1.9), (), cargo, cargo if box is None else RED, 0.0, False
+    )
     add_body(builder, body, [])
-    add_box(builder, (rear - 0.012, -0.9 * width / 2, 1.0), (rear, 0.9 * width / 2, top - 0.15), (linear("b9bcbd"), Kind.METAL))
+    add_box(
+        builder,
+        (rear - 0.012, -0.9 * width / 2, 1.0),
+        (rear, 0.9 * width / 2, top - 0.15),
+        (linear("b9bcbd"), Kind.METAL),
+    )
     add_box(builder, (rear - 0.02, -0.02, 1.0), (rear, 0.02, top - 0.15), DARK)
     add_bumper(builder, rear - 0.01, 0.1, width / 2 - 0.1, 0.5, 0.62)
     add_lamp_pair(builder, rear - 0.01, width * 0.41, 0.75, (0.06, 0.26, 0.16), Kind.TAILLAMP)
@@ -188,7 +223,18 @@ def build_semi(rng: np.random.Generator) -> Mesh:
     paint: Look = (draw_paint(rng), Kind.PAINT)
     bonnet = Body(front - 1.9, front, 2.0, 0.55, 1.75, (1.0, 1.4), (), paint, paint, 0.3, False)
     add_body(builder, bonnet, wheels[:1])
-    cab = Body(front - 4.0, front - 1.75, 2.4, 0.55, 3.1, (1.75, 2.55), ((front - 2.9, front - 1.95),), paint, paint, 0.3)
+    cab = Body(
+        front - 4.0,
+        front - 1.75,
+        2.4,
+        0.55,
+        3.1,
+        (1.75, 2.55),
+        ((front - 2.9, front - 1.95),),
+        paint,
+        paint,
+        0.3,
+    )
     add_body(builder, cab, [])
     add_box(builder, (front + 0.04, -0.55, 0.75), (front + 0.18, 0.55, 1.6), (CHROME, Kind.METAL))
     add_bumper(builder, front + 0.22, 0.25, 1.2, 0.4, 0.72)
@@ -198,11 +244,13 @@ def build_semi(rng: np.random.Generator) -> Mesh:
     add_box(builder, (-front + 0.3, -0.5, 0.7), (front - 2.0, 0.5, 1.0), DARK)
     trailer_colour = ("e6e6e2", "dcdcd8", "c9ccce", "9a2f22", "2f4f86")[int(rng.integers(5))]
     trailer: Look = (linear(trailer_colour), Kind.PAINT)
-    add_body(builder, Body(-front, front - 4.5, width, 1.1, 3.95, (1.6, 2.0), (), trailer, trailer, 0.0, False), [])
+    add_body(
+        builder, Body(-front, front - 4.5, width, 1.1, 3.95, (1.6, 2.0), (), trailer, trailer, 0.0, False), []
+    )
     add_box(builder, (-front - 0.012, -1.15, 1.2), (-front, 1.15, 3.8), (linear("aeb1b2"), Kind.METAL))
     add_box(builder, (-front - 0.02, -0.02, 1.2), (-front, 0.02, 3.8), DARK)
     add_bumper(builder, -front - 0.01, 0.1, 1.1, 0.5, 0.62)
-    _lights(builder, front + 0.02, -front - 0.01, 1.15, 1.0, 0.85)
+    add_lights(builder, front + 0.02, -front - 0.01, 1.15, 1.0, 0.85)
     add_mirrors(builder, front - 1.85, 1.22, 2.1, DARK, 2.2)
     add_wheels(builder, wheels, CHROME)
     add_plates(builder, front + 0.225, -front - 0.03, 0.55, 0.8)
@@ -212,17 +260,32 @@ def build_semi(rng: np.random.Generator) -> Mesh:
 def build_mixer(rng: np.random.Generator) -> Mesh:
     """A concrete mixer: a cab, a leaning drum with a painted spiral band, a chute."""
     builder = MeshBuilder()
-    length, width = float(rng.uniform(7.6, 8.6)), 2.45
+    length = float(rng.uniform(7.6, 8.6))
     front = length / 2
-    wheels = [Wheel(front - 1.3, 0.5, 0.3, 1.2)] + [Wheel(x, 0.5, 0.55, 1.22) for x in (-front + 1.4, -front + 2.7)]
+    wheels = [Wheel(front - 1.3, 0.5, 0.3, 1.2)] + [
+        Wheel(x, 0.5, 0.55, 1.22) for x in (-front + 1.4, -front + 2.7)
+    ]
     paint: Look = (linear(("e4e4e0", "d8731c", "2e6a9e", "c9a41f")[int(rng.integers(4))]), Kind.PAINT)
     band: Look = (linear(("c8401f", "27486f", "3b7a3f")[int(rng.integers(3))]), Kind.PAINT)
     _add_cab(builder, front, 1.9, 2.35, 2.75, wheels, paint)
     add_box(builder, (-front + 0.2, -0.55, 0.7), (front - 0.4, 0.55, 1.15), DARK)
-    points = [(front - 2.2, 2.05, 0.55), (front - 3.2, 2.2, 1.15), (-0.6, 2.35, 1.25), (-front + 1.2, 2.75, 0.75), (-front + 0.5, 2.95, 0.45)]
-    for k, ((x0, z0, r0), (x1, z1, r1)) in enumerate(zip(points[:-1], points[1:], strict=True)):
+    points = [
+        (front - 2.2, 2.05, 0.55),
+        (front - 3.2, 2.2, 1.15),
+        (-0.6, 2.35, 1.25),
+        (-front + 1.2, 2.75, 0.75),
+        (-front + 0.5, 2.95, 0.45),
+    ]
+    for k, ((x0, z0, r0), (x1, z1, r1)) in enumerate(pairwise(points)):
         add_tube(builder, (x0, 0, z0), (x1, 0, z1), (r0, r1), band if k % 2 else paint, 16)
-    add_tube(builder, (-front + 0.5, 0.0, 2.9), (-front + 0.05, 0.0, 1.5), (0.35, 0.2), (linear("8d9093"), Kind.METAL), 8)
+    add_tube(
+        builder,
+        (-front + 0.5, 0.0, 2.9),
+        (-front + 0.05, 0.0, 1.5),
+        (0.35, 0.2),
+        (linear("8d9093"), Kind.METAL),
+        8,
+    )
     add_box(builder, (-front + 0.4, -0.9, 1.1), (-front + 0.6, 0.9, 2.2), DARK)
     add_wheels(builder, wheels)
     add_lamp_pair(builder, -front + 0.2, 1.0, 0.9, (0.06, 0.24, 0.2), Kind.TAILLAMP)
@@ -252,75 +315,15 @@ def build_excavator(rng: np.random.Generator) -> Mesh:
     add_box(builder, (-0.5, -1.28, 1.45), (1.0, -0.3, 1.75), YELLOW)
     lift = float(rng.uniform(0.0, 0.5))
     elbow, wrist = (3.0, -0.1, 3.6 + lift), (4.3, -0.1, 1.9 + lift)
-    for a, b, r in (((0.6, -0.1, 1.6), (1.9, -0.1, 3.4 + lift), 0.24), ((1.9, -0.1, 3.4 + lift), elbow, 0.22), (elbow, wrist, 0.18)):
+    for a, b, r in (
+        ((0.6, -0.1, 1.6), (1.9, -0.1, 3.4 + lift), 0.24),
+        ((1.9, -0.1, 3.4 + lift), elbow, 0.22),
+        (elbow, wrist, 0.18),
+    ):
         add_tube(builder, a, b, r, YELLOW, 6)
     add_tube(builder, (0.9, -0.1, 1.5), (1.9, -0.1, 3.1 + lift), 0.09, (CHROME, Kind.METAL), 8)
     add_box(builder, (3.7, -0.55, 1.05 + lift), (4.5, 0.35, 1.85 + lift), (linear("3f4143"), Kind.METAL), 0.0)
     add_box(builder, (0.6, 0.6, 2.85), (0.8, 0.8, 2.98), (LAMP_AMBER, Kind.BEACON))
-    add_lamp_pair(builder, 1.1, 1.0, 2.8, (0.1, 0.16, 0.12), Kind.HEADLAMP)
+    add_box(builder, (1.0, 0.95, 2.85), (1.1, 1.2, 2.97), (LAMP_CLEAR, Kind.HEADLAMP))
     mesh = builder.build()
     return mesh.moved(scale * np.eye(3), np.zeros(3)) if scale != 1.0 else mesh
-
-
-def _add_light_bar(builder: MeshBuilder, x: float, z: float, half: float) -> None:
-    """Blue on the left, red on the right, as on North American vehicles."""
-    blue, red = linear("1f4fd0"), linear("d01f1f")
-    add_box(builder, (x - 0.16, -half, z), (x + 0.16, half, z + 0.05), DARK)
-    add_box(builder, (x - 0.14, 0.08, z + 0.05), (x + 0.14, half - 0.03, z + 0.17), (blue, Kind.BEACON))
-    add_box(builder, (x - 0.14, -half + 0.03, z + 0.05), (x + 0.14, -0.08, z + 0.17), (red, Kind.BEACON))
-
-
-def build_police(rng: np.random.Generator) -> Mesh:
-    """A black patrol car with white doors and a light bar."""
-    builder = MeshBuilder()
-    style = "suv" if rng.random() < 0.5 else "sedan"
-    car = draw_car(style, rng, paint=linear("15171a"))
-    builder.add_mesh(build_car(car))
-    middle = 0.5 * (car.hood_x + car.side_end_x)
-    for side in (-1.0, 1.0):
-        y0, y1 = sorted((side * (car.width / 2 - 0.05), side * (car.width / 2 + 0.006)))
-        low, high = car.clearance + 0.24, car.belt - 0.19
-        add_box(builder, (middle - 0.95, y0, low), (middle + 0.75, y1, high), WHITE)
-    _add_light_bar(builder, 0.5 * (car.screen_x + car.roof_end_x) + 0.15, car.height + 0.01, 0.6)
-    return builder.build()
-
-
-def build_ambulance(rng: np.random.Generator) -> Mesh:
-    """A white box-bodied ambulance with a red band and light bars."""
-    mesh = build_box_truck(rng, WHITE, WHITE)
-    builder = MeshBuilder()
-    builder.add_mesh(mesh)
-    high, front = float(mesh.vertices[:, 2].max()), float(mesh.vertices[:, 0].max())
-    half = float(mesh.vertices[:, 1].max()) - 0.45
-    _add_light_bar(builder, front - 2.2, high, half)
-    add_lamp_pair(builder, float(mesh.vertices[:, 0].min()) + 0.02, half, high - 0.2, (0.05, 0.25, 0.15), Kind.BEACON)
-    return builder.build()
-
-
-def build_fire_engine(rng: np.random.Generator) -> Mesh:
-    """A red fire engine: crew cab, equipment lockers, a ladder on the roof."""
-    builder = MeshBuilder()
-    length, width, height = float(rng.uniform(8.0, 9.2)), 2.45, 2.95
-    front = length / 2
-    wheels = [Wheel(front - 1.5, 0.5, 0.3, 1.2), Wheel(-front + 2.1, 0.5, 0.5, 1.2)]
-    cab = Body(front - 3.2, front, width, 0.5, height, (1.5, 2.5), ((front - 1.2, front - 0.2), (front - 2.6, front - 1.5)), RED, WHITE, 0.25)
-    add_body(builder, cab, wheels)
-    add_body(builder, Body(-front, front - 3.25, width, 0.55, 2.8, (1.2, 1.5), (), RED, WHITE, 0.0, False), wheels)
-    shutter: Look = (linear("a9adb0"), Kind.METAL)
-    for x in np.arange(-front + 0.25, front - 4.6, 1.45):
-        for side in (-1.0, 1.0):
-            y0, y1 = sorted((side * (width / 2 - 0.05), side * (width / 2 + 0.01)))
-            if abs(x + 0.6 - wheels[1].x) > 0.9:
-                add_box(builder, (x, y0, 1.0), (x + 1.2, y1, 2.4), shutter)
-    for y in (-0.35, 0.35):
-        add_tube(builder, (-front + 0.1, y, 2.95), (front - 3.4, y, 2.95), 0.05, shutter, 6)
-    for x in np.arange(-front + 0.3, front - 3.5, 0.45):
-        add_tube(builder, (x, -0.35, 2.95), (x, 0.35, 2.95), 0.03, shutter, 5)
-    _add_light_bar(builder, front - 0.6, height, 1.0)
-    add_bumper(builder, front + 0.4, 0.5, 1.15, 0.45, 0.75)
-    add_box(builder, (-front + 0.3, -0.85, 0.55), (front - 0.2, 0.85, 1.0), DARK)
-    _lights(builder, front + 0.08, -front - 0.01, width / 2, 1.0, 0.9)
-    add_mirrors(builder, front - 0.1, width / 2 + 0.02, 2.1, DARK, 1.9)
-    add_wheels(builder, wheels, CHROME)
-    add_plates(builder, front + 0.405, -front - 0.01, 0.6, 0.72)
-    return builder.build()

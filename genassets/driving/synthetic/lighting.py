@@ -6,6 +6,7 @@ Radiance is linear RGB in units of a sunlit white wall; `develop` makes a pictur
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ LAMP_REACH = 28.0
 """Street lamps farther away than this add nothing, metres."""
 LAMP_COLOUR = np.array([1.0, 0.78, 0.50], dtype=np.float32)
 BEAM_COLOUR = np.array([1.0, 0.95, 0.85], dtype=np.float32)
+ROOM_COLOUR = np.array([0.62, 0.44, 0.22], dtype=np.float32)
 SHADOW_OFFSET = 0.006
 """Shadow rays start this far off the surface, metres."""
 
@@ -69,7 +71,7 @@ def draw_light(night: bool, lamps: NDArray[np.float64], rng: np.random.Generator
 
     if night:
         none = colour(0.0, 0.0, 0.0)
-        zenith, horizon = colour(0.004, 0.006, 0.012), colour(0.022, 0.020, 0.024)
+        zenith, horizon = colour(0.006, 0.009, 0.018), colour(0.034, 0.031, 0.036)
         return Light(
             True, sun.astype(np.float32), none, zenith, horizon, lamps.astype(np.float32), 2.6, texture, 0.15
         )
@@ -97,7 +99,7 @@ def _tiling_noise(rng: np.random.Generator, size: int = 512) -> F32:
     return np.asarray((field - field.mean()) / field.std(), dtype=np.float32)
 
 
-def _noise(light: Light, x: F32, y: F32, metres_per_tile: float) -> F32:
+def _noise(light: Light, x: NDArray[Any], y: NDArray[Any], metres_per_tile: float) -> F32:
     scale = 512 / metres_per_tile
     return light.texture[(y * scale).astype(np.int64) & 511, (x * scale).astype(np.int64) & 511]
 

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.driving.synthetic.materials import CHROME, LAMP_CLEAR, LAMP_RED, TRIM, TYRE, Kind, draw_paint, linear
+from genassets.driving.synthetic.materials import (
+    CHROME,
+    LAMP_CLEAR,
+    LAMP_RED,
+    TRIM,
+    TYRE,
+    Kind,
+    draw_paint,
+    linear,
+)
 from genassets.driving.synthetic.mesh import Look, Mesh, MeshBuilder, add_box, add_ellipsoid, add_tube, quads
 
 Float = NDArray[np.float64]
@@ -19,7 +28,9 @@ def _look(rng: np.random.Generator, colours: tuple[str, ...]) -> Look:
     return (linear(colours[int(rng.integers(len(colours)))]), Kind.MATTE)
 
 
-def _polar(origin: tuple[float, float, float], angle: float, length: float, y: float) -> tuple[float, float, float]:
+def _polar(
+    origin: tuple[float, float, float], angle: float, length: float, y: float
+) -> tuple[float, float, float]:
     """The far end of a limb that hangs from origin, swung forward by `angle`, ending at y."""
     return (origin[0] + length * np.sin(angle), y, origin[2] - length * np.cos(angle))
 
@@ -57,7 +68,14 @@ def build_pedestrian(rng: np.random.Generator, carries: bool) -> Mesh:
             else:
                 add_box(builder, (-0.33, -0.15, hip + 0.12), (-0.12, 0.15, shoulder), bag)
     add_ellipsoid(builder, (0.0, 0.0, hip + 0.04), (0.11 * build, 0.165 * build, 0.11), trousers, 6, 12)
-    add_ellipsoid(builder, (0.0, 0.0, 0.5 * (hip + shoulder) + 0.05), (0.125 * build, 0.195 * build, 0.19 * height), shirt, 8, 14)
+    add_ellipsoid(
+        builder,
+        (0.0, 0.0, 0.5 * (hip + shoulder) + 0.05),
+        (0.125 * build, 0.195 * build, 0.19 * height),
+        shirt,
+        8,
+        14,
+    )
     add_ellipsoid(builder, (0.0, 0.0, shoulder), (0.09 * build, 0.215 * build, 0.065), shirt, 6, 12)
     _add_head(builder, (0.01, 0.0, height - 0.125), skin, hair)
     mesh = builder.build()
@@ -71,7 +89,9 @@ def _add_head(builder: MeshBuilder, centre: tuple[float, float, float], skin: Lo
     add_ellipsoid(builder, (x - 0.022, y, z + 0.03), (0.098, 0.086, 0.108), hair, 7, 10)
 
 
-def _add_hoop(builder: MeshBuilder, centre: tuple[float, float, float], radius: float, thickness: float, look: Look) -> None:
+def _add_hoop(
+    builder: MeshBuilder, centre: tuple[float, float, float], radius: float, thickness: float, look: Look
+) -> None:
     """A wheel's ring about the y axis."""
     around = np.linspace(0.0, 2 * np.pi, 21)[:, None]
     across = np.linspace(0.0, 2 * np.pi, 7)[None]
@@ -88,7 +108,9 @@ def _add_hoop(builder: MeshBuilder, centre: tuple[float, float, float], radius: 
     builder.add(vertices, triangles, look)
 
 
-def _add_rider(builder: MeshBuilder, seat: Float, bar: Float, pedal_z: float, helmet: Look, rng: np.random.Generator) -> None:
+def _add_rider(
+    builder: MeshBuilder, seat: Float, bar: Float, pedal_z: float, helmet: Look, rng: np.random.Generator
+) -> None:
     """Someone who sits at `seat` (3,) and holds a handlebar whose middle is `bar` (3,)."""
     skin, shirt, trousers = _look(rng, SKINS), _look(rng, SHIRTS), _look(rng, TROUSERS)
     shoulder = seat + np.array([0.28, 0.0, 0.47])
@@ -107,7 +129,12 @@ def _add_rider(builder: MeshBuilder, seat: Float, bar: Float, pedal_z: float, he
         knee = 0.5 * (hip + foot) + np.array([0.24, side * 0.02, 0.1])
         add_tube(builder, hip, knee, (0.085, 0.065), trousers, 9)
         add_tube(builder, knee, foot, (0.06, 0.045), trousers, 9)
-        add_box(builder, (foot[0] - 0.08, foot[1] - 0.04, foot[2] - 0.07), (foot[0] + 0.16, foot[1] + 0.04, foot[2]), (TRIM, Kind.MATTE))
+        add_box(
+            builder,
+            (foot[0] - 0.08, foot[1] - 0.04, foot[2] - 0.07),
+            (foot[0] + 0.16, foot[1] + 0.04, foot[2]),
+            (TRIM, Kind.MATTE),
+        )
     head = shoulder + np.array([0.09, 0.0, 0.2])
     _add_head(builder, (float(head[0]), 0.0, float(head[2])), skin, helmet)
 
@@ -125,7 +152,14 @@ def build_bicycle(rng: np.random.Generator) -> Mesh:
             dx, dz = 0.3 * np.cos(angle), 0.3 * np.sin(angle)
             add_tube(builder, (x - dx, 0.0, r - dz), (x + dx, 0.0, r + dz), 0.004, (CHROME, Kind.METAL), 4)
     crank, saddle, head = (-0.08, 0.0, 0.29), (-0.24, 0.0, 0.92), (0.40, 0.0, 0.90)
-    for a, b in ((crank, saddle), (crank, head), ((-0.22, 0, 0.82), head), ((-half, 0, r), crank), ((-half, 0, r), (-0.22, 0, 0.82)), ((half, 0, r), head)):
+    for a, b in (
+        (crank, saddle),
+        (crank, head),
+        ((-0.22, 0, 0.82), head),
+        ((-half, 0, r), crank),
+        ((-half, 0, r), (-0.22, 0, 0.82)),
+        ((half, 0, r), head),
+    ):
         add_tube(builder, a, b, 0.02, frame, 6)
     add_tube(builder, (0.40, 0.0, 0.9), (0.38, 0.0, 1.05), 0.016, (TRIM, Kind.METAL), 6)
     add_tube(builder, (0.40, -0.28, 1.05), (0.40, 0.28, 1.05), 0.016, (TRIM, Kind.MATTE), 6)

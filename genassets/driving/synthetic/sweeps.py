@@ -19,12 +19,14 @@ from genassets.driving.synthetic.rig import (
     spinning_time,
 )
 from genassets.driving.synthetic.spec import CitySpec
-from genassets.driving.synthetic.tracing import TracedCity
+from genassets.driving.synthetic.tracing import Solid, TracedCity
 from genassets.driving.synthetic.trajectories import Path
 
 Float = NDArray[np.float64]
 MAX_RANGE = 200.0
 MIN_RANGE = 1.0
+SPINNING_GAIN, FORWARD_GAIN = 0.6, 1.6
+"""Scale of the intensities: on PandaSet the forward LiDAR's median is about three times the spinning one's."""
 
 
 @dataclass(frozen=True)
@@ -59,34 +61,61 @@ def cast_sweep(
     spec: CitySpec,
     city_at: Callable[[int], TracedCity],
     ego: Path,
+    ego_car: Solid,
     stamp: float,
     rng: np.random.Generator,
 ) -> tuple[Returns, Returns]:
     """The spinning and the forward LiDAR's returns of the sweep stamped `stamp` (log seconds).
 
-    city_at(sensor) gives the city with every mover where that LiDAR's beam finds it.
+    city_at(sensor) gives the city, without the ego car, with every mover where that LiDAR's beam finds it.
+    ego_car, in the ego frame, hides what is behind it and gives no returns of its own.
     """
-    spinning, forward = spinning_pattern(spec.spinning_columns), forward_pattern(spec.forward_columns, spec.forward_rows)
-    return (
-        _cast(spec, city_at(0), ego, stamp + spinning_time(spinning[0]), spinning, SPINNING_POSITION, 0.6, rng),
-        _cast(spec, city_at(1), ego, stamp + forward_time(forward[0]), forward, FORWARD_POSITION, 1.6, rng),
+    views = (
+        (spinning_pattern(spec.spinning_columns), spinning_time, SPINNING_POSITION, SPINNING_GAIN),
+        (
+            forward_pattern(spec.forward_columns, spec.forward_rows),
+            forward_time,
+            FORWARD_POSITION,
+            FORWARD_GAIN,
+        ),
     )
+    returns = []
+    for sensor, (pattern, time_of, mount, gain) in enumerate(views):
+        own = np.concatenate([np.broadcast_to(mount, (len(pattern[0]), 3)), _directions(*pattern)], axis=1)
+        hidden = ego_car.occluded(own.astype(np.float32), np.inf, 1)
+        times = stamp + time_of(pattern[0])
+        returns.append(_cast(spec, city_at(sensor), ego, times, pattern, hidden, mount, gain, rng))
+    return returns[0], returns[1]
+
+
+def _directions(bearing: Float, elevation: Float) -> Float:
+    level = np.cos(elevation)
+    return np.stack([level * np.cos(bearing), level * np.sin(bearing), np.sin(elevation)], axis=-1)
 
 
 def _cast(
-    spec: CitySpec, city: TracedCity, ego: Path, times: Float, pattern: tuple[Float, Float], mount: Float, gain: float,
+    spec: CitySpec,
+    city: TracedCity,
+    ego: Path,
+    times: Float,
+    pattern: tuple[Float, Float],
+    hidden: NDArray[np.bool_],
+    mount: Float,
+    gain: float,
     rng: np.random.Generator,
-) -> Returns:  # fmt: skip
+) -> Returns:
     bearing, elevation = pattern
     position, heading = ego.at(times)
     c, s = np.cos(heading), np.sin(heading)
     origins = np.stack(
-        [position[:, 0] + c * mount[0] - s * mount[1], position[:, 1] + s * mount[0] + c * mount[1], np.full(len(c), mount[2])], -1
+        [
+            position[:, 0] + c * mount[0] - s * mount[1],
+            position[:, 1] + s * mount[0] + c * mount[1],
+            np.full(len(c), mount[2]),
+        ],
+        -1,
     )
-    level = np.cos(elevation)
-    directions = np.stack(
-        [level * np.cos(bearing + heading), level * np.sin(bearing + heading), np.sin(elevation)], axis=-1
-    )
+    directions = _directions(bearing + heading, elevation)
     hits = city.cast(origins.astype(np.float32), directions.astype(np.float32))
     # Every beam draws the same numbers whatever it hits, so one actor more does not reshuffle the noise.
     noise, luck, speckle = rng.standard_normal(len(c)), rng.random(len(c)), rng.normal(1.0, 0.12, len(c))
@@ -105,9 +134,11 @@ def _cast(
         + 0.4 * np.clip(1.0 - brightness / 0.05, 0.0, 1.0) * far
         + 0.3 * far**2
     )
-    seen = (hits.triangle >= 0) & (distance < MAX_RANGE) & (distance > MIN_RANGE) & (luck >= lost)
+    seen = ~hidden & (hits.triangle >= 0) & (distance < MAX_RANGE) & (distance > MIN_RANGE) & (luck >= lost)
     measured = distance[seen] + spec.range_noise * noise[seen]
-    strength = (60.0 * brightness * (0.35 + 0.65 * incidence) + RETROREFLECTION[kind] * incidence) * gain * speckle
+    strength = (
+        (60.0 * brightness * (0.35 + 0.65 * incidence) + RETROREFLECTION[kind] * incidence) * gain * speckle
+    )
     return Returns(
         origins[seen] + measured[:, None] * directions[seen],
         np.floor(np.clip(strength[seen], 0.0, 255.0)),

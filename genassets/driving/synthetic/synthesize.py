@@ -34,7 +34,8 @@ from genassets.driving.synthetic.trajectories import Path as Drive
 from genassets.driving.synthetic.trajectories import ego_drive
 from genassets.driving.synthetic.truth import TruthWriter
 from genassets.errors import EnvironmentProblem, LogError
-from genassets.geometry.transforms import make_pose, transform_points
+from genassets.geometry.cameras import project
+from genassets.geometry.transforms import invert_pose, make_pose, transform_points
 from genassets.geometry.turntable import TURNS, turntable_camera
 
 Float = NDArray[np.float64]
@@ -91,7 +92,9 @@ class Scene:
             if actor.model.actor_class != "Pedestrian":
                 _, centre, angle = actor.pose(time)
                 rows.append((centre[:2], angle, actor.model.size[:2] / 2))
-        return Footprints(np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows]))
+        return Footprints(
+            np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows])
+        )
 
     def beam(self, time: float) -> Beam | None:
         """The ego car's low beam, at night."""
@@ -141,7 +144,13 @@ def camera_view(scene: Scene, camera: str, frame: int) -> tuple[Picture, NDArray
     intrinsics = mount.intrinsics.resized(scene.spec.image_width, scene.spec.image_height)
     pose = scene.city_from_ego(time) @ mount.ego_from_camera
     picture = render(
-        city, scene.light, intrinsics, pose, scene.spec.supersampling, scene.footprints(time), scene.beam(time)
+        city,
+        scene.light,
+        intrinsics,
+        pose,
+        scene.spec.supersampling,
+        scene.footprints(time),
+        scene.beam(time),
     )
     rng = np.random.default_rng([scene.seed, 1, frame, CAMERA_INDEX[camera]])
     return picture, expose(picture.rgb, scene.spec.image_noise, scene.light.night, rng)
@@ -159,7 +168,10 @@ def lidar_view(scene: Scene, frame: int) -> tuple[Returns, Returns]:
         return scene.at(when, None)
 
     rng = np.random.default_rng([scene.seed, 2, frame])
-    return cast_sweep(scene.spec, city_at, scene.ego, stamp, rng)
+    lift = np.array([0.0, 0.0, scene.ego_car.size[2] / 2])
+    glow = glow_table(scene.light.night, moving=True)
+    ego_car = Solid([Placed(scene.ego_car.mesh.moved(np.eye(3), lift), 0, glow)])
+    return cast_sweep(scene.spec, city_at, scene.ego, ego_car, stamp, rng)
 
 
 def synthesize_log(
@@ -222,7 +234,9 @@ def _written_cameras(scene: Scene) -> dict[str, WrittenCamera]:
     return cameras
 
 
-def _write_frames(scene: Scene, writer: PandasetWriter, truth: TruthWriter, progress: Progress | None) -> None:
+def _write_frames(
+    scene: Scene, writer: PandasetWriter, truth: TruthWriter, progress: Progress | None
+) -> None:
     twin_rng = np.random.default_rng([scene.seed, 3])
     twins = {actor.instance: make_uuid(twin_rng) for actor in scene.actors}
     total = scene.spec.frames
@@ -287,8 +301,9 @@ def _cuboids(
         by = [sensor for sensor in (0, 1) if actor.instance in seen[sensor]]
         twinned = by == [0, 1] and not actor.stationary
         uuids = (actor.actor_id, twins[actor.instance])
-        for sensor in (0, 1) if twinned else (by[:1] or [None]):
-            time = stamp if sensor is None else found[sensor]
+        sensors: list[int | None] = [0, 1] if twinned else [*by[:1]] or [None]
+        for sensor in sensors:
+            time = found[sensor] if twinned and sensor is not None else found[0]
             _, centre, heading = actor.pose(time)
             rows.append(
                 WrittenCuboid(
@@ -320,7 +335,9 @@ def _write_actors(scene: Scene, truth: TruthWriter, progress: Progress | None) -
         # One street lamp beside the actor: what lights it in the city.
         light = replace(light, lamps=np.array([[2.0, 2.5, 5.0]], dtype=np.float32))
     with ThreadPoolExecutor(max(1, min(4, os.cpu_count() or 1))) as pool:
-        jobs = [(actor, pool.submit(turn_views, actor, light, scene.spec.supersampling)) for actor in scene.actors]
+        jobs = [
+            (actor, pool.submit(turn_views, actor, light, scene.spec.supersampling)) for actor in scene.actors
+        ]
         for number, (actor, job) in enumerate(jobs):
             truth.add_mesh(actor.actor_id, actor.model.mesh)
             for azimuth, rgba in job.result().items():
@@ -350,7 +367,16 @@ def turn_views(actor: Actor, light: Light, supersampling: int) -> dict[int, NDAr
     views = {}
     for azimuth in TURNS:
         intrinsics, box_from_camera = turntable_camera(actor.model.size, azimuth)
-        picture = render(alone, light, intrinsics, box_from_camera, supersampling, cut_out=True)
+        pixels = project(
+            intrinsics, transform_points(invert_pose(box_from_camera), actor.model.mesh.vertices)
+        )
+        # Only the part of the picture where the actor is gets any rays.
+        x0, y0 = np.clip(np.floor(pixels.min(0)).astype(int) - 1, 0, intrinsics.width - 1).tolist()
+        x1, y1 = np.clip(np.ceil(pixels.max(0)).astype(int) + 1, 1, intrinsics.width).tolist()
+        part = intrinsics.cropped(x0, y0, x1, y1)
+        picture = render(alone, light, part, box_from_camera, supersampling, cut_out=True)
         rgba = np.concatenate([picture.rgb, picture.coverage[..., None]], axis=-1)
-        views[azimuth] = np.round(np.clip(rgba, 0.0, 1.0) * 255).astype(np.uint8)
+        view = np.zeros((intrinsics.height, intrinsics.width, 4), dtype=np.uint8)
+        view[y0:y1, x0:x1] = np.round(np.clip(rgba, 0.0, 1.0) * 255)
+        views[azimuth] = view
     return views

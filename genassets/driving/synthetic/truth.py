@@ -107,13 +107,17 @@ class TruthWriter:
         self._root = root
         self._digits = max(2, len(str(frame_count - 1)))
 
-    def add_picture(self, camera: str, frame: int, instances: NDArray[np.uint16], depth: NDArray[np.float32]) -> None:
+    def add_picture(
+        self, camera: str, frame: int, instances: NDArray[np.uint16], depth: NDArray[np.float32]
+    ) -> None:
         """Write a camera frame's instances (H, W) and depths (H, W) in metres."""
         name = f"{frame:0{self._digits}d}.png"
         self._write_png(f"instances/{camera}/{name}", instances)
         steps = np.clip(np.round(depth / DEPTH_STEP), 0, 65535).astype(np.uint16)
         # A surface nearer than half a step would read as sky.
-        self._write_png(f"depth/{camera}/{name}", np.where((depth > 0) & (steps == 0), 1, steps).astype(np.uint16))
+        self._write_png(
+            f"depth/{camera}/{name}", np.where((depth > 0) & (steps == 0), 1, steps).astype(np.uint16)
+        )
 
     def add_mesh(self, actor_id: str, mesh: Mesh) -> None:
         """Write an actor's mesh, its triangles' colours put on vertices of their own."""
@@ -169,7 +173,9 @@ def read_ply(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArra
     end = content.find(b"end_header\n")
     if end < 0:
         raise LogError(f"{path}: is missing or no PLY; make the synthetic log again.")
-    counts = [int(line.split()[2]) for line in content[:end].decode().splitlines() if line.startswith("element")]
+    counts = [
+        int(line.split()[2]) for line in content[:end].decode().splitlines() if line.startswith("element")
+    ]
     start = end + len(b"end_header\n")
     vertices = np.frombuffer(content, _PLY_VERTEX, counts[0], start)
     faces = np.frombuffer(content, _PLY_FACE, counts[1], start + vertices.nbytes)
