@@ -52,7 +52,7 @@ def log(tmp_path: Path) -> Log:
         name="front_camera",
         intrinsics=Intrinsics(100.0, 100.0, WIDTH / 2, HEIGHT / 2, WIDTH, HEIGHT),
         world_from_camera=np.tile(np.eye(4), (FRAMES, 1, 1)),
-        times=np.arange(FRAMES) * 0.1,
+        times=np.arange(FRAMES, dtype=np.float64) / 10,
         image_paths=tuple(paths),
     )
     return Log(
@@ -60,7 +60,7 @@ def log(tmp_path: Path) -> Log:
         root=tmp_path,
         start_time=0.0,
         frame_count=FRAMES,
-        frame_times=np.arange(FRAMES) * 0.1,
+        frame_times=np.arange(FRAMES, dtype=np.float64) / 10,
         world_from_ego=np.tile(np.eye(4), (FRAMES, 1, 1)),
         world_from_lidar=np.tile(np.eye(4), (FRAMES, 1, 1)),
         cameras={"front_camera": stream},

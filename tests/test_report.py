@@ -140,12 +140,12 @@ def test_picture_outside_its_output_is_refused(run_dir: Path) -> None:
 def test_model_stands_first_and_the_best_value_is_marked() -> None:
     table = metric_table("t", ROWS[:5], ("setting", "method"))
     assert [line.labels[1] for line in table.rows] == ["model", "nearest_crop", "mean_colour"]
-    assert table.measures == ("psnr", "lpips", "n")
+    assert table.measures == ("PSNR, dB \u2191", "LPIPS \u2193", "n")
     assert [cell.best for cell in table.rows[0].cells] == [True, False, False]
     assert [cell.best for cell in table.rows[1].cells] == [False, True, False]  # a small LPIPS is good
     assert table.rows[2].cells[1].text == ""
     assert [line.first for line in table.rows] == [True, False, False]
-    assert "psnr: masked pixels; mask=truth" in table.notes
+    assert "PSNR, dB: masked pixels; mask=truth" in table.notes
 
 
 def test_evaluation_rows_are_shared_out_over_tables() -> None:
@@ -167,7 +167,8 @@ def test_values_are_written_with_fitting_decimals() -> None:
 
 
 def test_running_mean_by_hand() -> None:
-    assert running_mean(np.array([1.0, 3.0, 5.0, 7.0]), 1).tolist() == [1.0, 2.0, 4.0, 6.0]
+    assert running_mean(np.array([1.0, 3.0, 8.0, 7.0]), 1).tolist() == [1.0, 4.0, 6.0, 7.0]
+    assert running_mean(np.arange(9.0), 3).tolist() == list(range(9))  # a straight line stays
 
 
 def test_plot_has_the_same_bytes_every_time(tmp_path: Path) -> None:

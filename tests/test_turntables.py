@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import trimesh
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from genassets.evaluation.shape import extent_error, sample_surface, silhouette_iou, surface_distance
 from genassets.evaluation.turn_selection import angle_between, select_actors
@@ -19,6 +19,7 @@ from genassets.export.picture_list import PictureList
 from genassets.export.turntable import (
     colour_panel,
     depth_panel,
+    filled_rows,
     render_turns,
     shape_panel,
     surface_normals,
@@ -87,6 +88,10 @@ def test_panels_stand_on_white_and_make_a_sheet() -> None:
         assert panel[24, 24].min() < 0.95
     sheet = turntable_sheet([("model", [colour_panel(v) for v in views])], (0, 90))
     assert sheet.shape[1] == 84 + 2 * 52
+    top, bottom = filled_rows([view.image.alpha for view in views], margin=0)
+    filled = np.flatnonzero(views[0].image.alpha.any(axis=1) | views[1].image.alpha.any(axis=1))
+    assert (top, bottom) == (filled[0], filled[-1] + 1)
+    assert filled_rows([np.zeros((8, 8))]) == (0, 8)
 
 
 def test_normals_of_a_fronto_parallel_plane_face_the_camera() -> None:
@@ -197,6 +202,6 @@ def test_picture_list_names_every_file(tmp_path: Path) -> None:
     assert [entry["title"] for entry in entries] == ["One", "Two"]
     assert all((tmp_path / entry["file"]).is_file() for entry in entries)
     with Image.open(tmp_path / "pictures" / "two.webp") as animation:
-        assert animation.n_frames == 2
+        assert len(list(ImageSequence.Iterator(animation))) == 2
     with pytest.raises(ValueError, match="one name"):
         pictures.add("one", frame, "One", "again")

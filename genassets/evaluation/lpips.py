@@ -64,12 +64,14 @@ class Lpips(nn.Module):
 
     def __init__(self, arrays: Mapping[str, Any], backbone: Backbone = "alexnet"):
         super().__init__()
+        strides: tuple[int, ...]
+        taps: tuple[int, ...]
         if backbone == "alexnet":
             network, strides, pools, taps = (
                 arrays["AlexNet_0"],
                 (4, 1, 1, 1, 1),
                 {1: (3, 2), 2: (3, 2)},
-                range(5),
+                (0, 1, 2, 3, 4),
             )
         else:
             network, strides = arrays["VGG16_0"], (1,) * 13

@@ -48,6 +48,9 @@ VIEW_SCHEMA = pa.schema(
     ]
 )
 
+GAIN_MEASURES = ("psnr", "ssim", "lpips")
+"""Measures whose differences to the baselines are stated; that of `psnr_on_black` would repeat that of `psnr`."""
+
 METHOD_OF_MEASURE = {
     "psnr": "masked pixels, capped at 100 dB",
     "ssim": "scikit-image 7x7 uniform, mean of the map over the mask",
@@ -141,10 +144,8 @@ def means(observations: pd.DataFrame) -> list[Mean]:
         return []
     frame = _with_caps(observations)
     mask_rule = "mask=" + "+".join(sorted(frame["segmenter"].unique()))
-    groups = {
-        "all": frame[frame["group"] != "unseen"],
-        **{name: frame[frame["group"] == name] for name in ("moved", "same", "unseen")},
-    }
+    groups = {name: frame[frame["group"] == name] for name in ("moved", "same", "unseen")}
+    groups["all"] = frame[frame["group"] != "unseen"]
     rows: list[Mean] = []
     for group, part in groups.items():
         for split, class_name, subset in _subsets(part):
@@ -185,7 +186,7 @@ def _means_of(
             if len(values):
                 yield Mean(setting, split, class_name, measure, float(values.mean()), len(values),
                            f"{predictor}; {method}")  # fmt: skip
-        for baseline in PREDICTORS[1:]:
+        for baseline in PREDICTORS[1:] if measure in GAIN_MEASURES else ():
             gains = (model[measure] - by_predictor[baseline][measure]).dropna()
             if len(gains):
                 yield Mean(setting, split, class_name, f"{measure}_gain", float(gains.mean()), len(gains),

@@ -61,21 +61,26 @@ def select_actors(
     for name, group in observed.groupby("actor_class", sort=True):
         first = group.iloc[0]
         reasons.setdefault((first["log"], first["actor_id"]), []).append(f"most observed {name}")
-    azimuths = {
-        (log, actor): tuple(float(a) for a in group["azimuth"])
-        for (log, actor), group in views[views["training"]].groupby(["log", "actor_id"])
-    }
+    azimuths: dict[tuple[str, str], tuple[float, ...]] = {}
+    for view in views[views["training"]].to_dict("records"):
+        key = (view["log"], view["actor_id"])
+        azimuths[key] = (*azimuths.get(key, ()), float(view["azimuth"]))
     for key in _never_from_behind(observed, azimuths)[:count]:
         reasons.setdefault(key, []).append("never seen from behind")
-    asset_of = assets.set_index(["log", "actor_id"])
-    psnr_of = model.set_index(["log", "actor_id"])["psnr"].to_dict()
+    asset_of = {(asset["log"], asset["actor_id"]): asset for asset in assets.to_dict("records")}
+    psnr_of = dict(zip(ranked, model["psnr"].astype(float), strict=True))
     turned = []
     for key, why in reasons.items():
-        asset = asset_of.loc[key]
-        size = (float(asset["size_l"]), float(asset["size_w"]), float(asset["size_h"]))
+        asset = asset_of[key]
         turned.append(
             TurnedActor(
-                *key, str(asset["actor_class"]), size, tuple(why), psnr_of.get(key), azimuths.get(key, ())
+                log=key[0],
+                actor_id=key[1],
+                actor_class=str(asset["actor_class"]),
+                size=(float(asset["size_l"]), float(asset["size_w"]), float(asset["size_h"])),
+                reasons=tuple(why),
+                psnr=psnr_of.get(key),
+                seen_azimuths=azimuths.get(key, ()),
             )
         )
     return turned

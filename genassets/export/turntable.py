@@ -110,24 +110,36 @@ def surface_normals(depth: NDArray, intrinsics: Intrinsics) -> NDArray[np.float6
     return np.asarray(np.where(facing > 0, -normals, normals))
 
 
+def filled_rows(alphas: Sequence[NDArray], margin: int = 6) -> tuple[int, int]:
+    """First and last row (exclusive) that any of the alphas (h, w) fills, with a margin; all where none does."""
+    filled = np.flatnonzero(np.max([np.asarray(alpha).max(axis=1) for alpha in alphas], axis=0) > 0.05)
+    height = alphas[0].shape[0]
+    if not len(filled):
+        return 0, height
+    return max(0, int(filled[0]) - margin), min(height, int(filled[-1]) + 1 + margin)
+
+
 def turntable_sheet(
     rows: Sequence[tuple[str, Sequence[NDArray]]], azimuths: Sequence[float]
 ) -> NDArray[np.uint8]:
     """Named rows of equal panels (h, w, 3), one a turn, under a line that says the azimuths; uint8."""
-    side = rows[0][1][0].shape[0]
+    height, width = rows[0][1][0].shape[:2]
     left, top, gap = 84, 22, 4
-    sheet = np.full((top + len(rows) * (side + gap), left + len(azimuths) * (side + gap), 3), 255, np.uint8)
+    sheet = np.full(
+        (top + len(rows) * (height + gap), left + len(azimuths) * (width + gap), 3), 255, np.uint8
+    )
     for column, azimuth in enumerate(azimuths):
         name = {0: "0 front", 90: "90 left", 180: "180 rear", 270: "270 right"}.get(
             round(azimuth), f"{azimuth:g}"
         )
-        _write(sheet, name, left + column * (side + gap) + 4, 15)
+        _write(sheet, name, left + column * (width + gap) + 4, 15)
     for index, (name, panels) in enumerate(rows):
-        y = top + index * (side + gap)
-        _write(sheet, name, 4, y + side // 2)
+        y = top + index * (height + gap)
+        _write(sheet, name, 4, y + height // 2)
         for column, panel in enumerate(panels):
-            x = left + column * (side + gap)
-            sheet[y : y + side, x : x + side] = (np.clip(panel, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+            x = left + column * (width + gap)
+            bytes_of_panel = (np.clip(panel, 0.0, 1.0) * 255 + 0.5).astype(np.uint8)
+            sheet[y : y + height, x : x + width] = bytes_of_panel
     return sheet
 
 

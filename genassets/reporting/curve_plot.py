@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,12 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
 
     columns = min(COLUMNS, len(curves))
     lines = -(-len(curves) // columns)
-    style = {"svg.fonttype": "none", "svg.hashsalt": path.stem, "font.size": 9, "font.family": "sans-serif"}
+    style: dict[Any, Any] = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": path.stem,
+        "font.size": 9,
+        "font.family": "sans-serif",
+    }
     with rc_context(style):
         figure = Figure(figsize=(3.6 * columns, 2.3 * lines), layout="constrained")
         FigureCanvasSVG(figure)
@@ -36,7 +42,7 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
         for axis, (name, steps, values) in zip(axes, curves, strict=False):
             axis.plot(steps, values, color="#9db7d5", linewidth=0.8)
             if len(values) >= 20:
-                axis.plot(steps, running_mean(values, len(values) // 20), color="#1f4e8c", linewidth=1.4)
+                axis.plot(steps, running_mean(values, len(values) // 40), color="#1f4e8c", linewidth=1.4)
             if values.min() > 0 and values.max() / values.min() > LOG_RANGE:
                 axis.set_yscale("log")
             axis.set_title(name, fontsize=9, loc="left")
@@ -50,9 +56,10 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
         figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None})
 
 
-def running_mean(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Mean over the last `width` values and the value itself; at the start over what there is."""
+def running_mean(values: NDArray[np.float64], reach: int) -> NDArray[np.float64]:
+    """Mean over each value and up to `reach` neighbours on either side, as many on both."""
     total = np.concatenate([[0.0], np.cumsum(values, dtype=np.float64)])
-    end = np.arange(1, len(values) + 1)
-    start = np.maximum(0, end - width - 1)
-    return np.asarray((total[end] - total[start]) / (end - start))
+    index = np.arange(len(values))
+    # As many on both sides also at the ends, so that a slope there is not flattened.
+    near = np.minimum(reach, np.minimum(index, len(values) - 1 - index))
+    return np.asarray((total[index + near + 1] - total[index - near]) / (2 * near + 1))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 MetricRow = Mapping[str, Any]
@@ -13,6 +13,24 @@ MetricRow = Mapping[str, Any]
 HIGHER_IS_BETTER = ("psnr", "ssim", "iou", "f_score", "watertight", "largest_part")
 LOWER_IS_BETTER = ("lpips", "chamfer", "extent_error", "fid", "kid")
 DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3}
+ARROWS = {1: " \u2191", -1: " \u2193", 0: ""}
+"""Behind a heading: whether more or less is better."""
+
+NAMES = {
+    "psnr": "PSNR, dB",
+    "ssim": "SSIM",
+    "ssim_gaussian11": "SSIM 11 x 11",
+    "lpips": "LPIPS",
+    "psnr_on_black": "PSNR on black, dB",
+    "psnr_gain": "PSNR gain, dB",
+    "ssim_gain": "SSIM gain",
+    "lpips_gain": "LPIPS gain",
+    "mask_iou": "mask IoU",
+    "silhouette_iou": "silhouette IoU",
+    "f_score": "F-score",
+    "chamfer": "Chamfer, m",
+}
+GROUP_ORDER = ("sparse_view/moved", "sparse_view/same", "sparse_view/all", "sparse_view/unseen")
 PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
 
 
@@ -57,7 +75,7 @@ def stage_tables(stage: str, rows: Sequence[MetricRow]) -> list[MetricTable]:
             "By class", by_class, ("setting", "split", "class", "method"), folded=len(by_class) > 40
         ),
     ]
-    return [table for table in tables if table.rows]
+    return _without_repeated_notes(tables)
 
 
 def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
@@ -88,7 +106,18 @@ def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
             "By group, class and log", details, ("setting", "split", "class", "method"), folded=True
         ),
     ]
-    return [table for table in tables if table.rows]
+    return _without_repeated_notes(tables)
+
+
+def _without_repeated_notes(tables: Iterable[MetricTable]) -> list[MetricTable]:
+    """The tables that have rows; a note that an earlier table has is left out."""
+    seen: set[str] = set()
+    kept = []
+    for table in tables:
+        if table.rows:
+            kept.append(replace(table, notes=tuple(note for note in table.notes if note not in seen)))
+            seen.update(table.notes)
+    return kept
 
 
 def metric_table(
@@ -111,6 +140,8 @@ def metric_table(
     ordered = sorted(lines, key=lambda key: (_group_rank(key, lines), _predictor_rank(key[-1])))
     best = _best_values(lines, measures) if compete and labels[-1] == "method" else {}
     table_rows = []
+    # A table of counts alone says n in every cell.
+    counted = any(row["value"] != row["n"] for line in lines.values() for row in line.values())
     previous: tuple[str, ...] | None = None
     for key in ordered:
         line = lines[key]
@@ -121,12 +152,23 @@ def metric_table(
             else Cell("")
             for measure in measures
         ]
-        sizes = sorted({int(row["n"]) for row in line.values()})
-        cells.append(Cell(f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"))
+        if counted:
+            sizes = sorted({int(row["n"]) for row in line.values()})
+            cells.append(Cell(f"{sizes[0]:,}" if len(sizes) == 1 else f"{sizes[0]:,} to {sizes[-1]:,}"))
         table_rows.append(TableRow(key, tuple(cells), first=group != previous))
         previous = group
-    written = tuple(f"{measure}: {'; '.join(texts)}" for measure, texts in notes.items())
-    return MetricTable(title, labels, (*measures, "n"), tuple(table_rows), written, folded)
+    written = tuple(
+        f"{measure_name(measure)}: {'; '.join(texts)}" for measure, texts in notes.items() if texts
+    )
+    headings = tuple(f"{measure_name(measure)}{ARROWS[_direction(measure)]}" for measure in measures)
+    return MetricTable(
+        title, labels, (*headings, "n") if counted else headings, tuple(table_rows), written, folded
+    )
+
+
+def measure_name(measure: str) -> str:
+    """The measure as people write it."""
+    return NAMES.get(measure, measure.replace("_", " "))
 
 
 def format_value(measure: str, value: float) -> str:
@@ -162,15 +204,21 @@ def _best_values(
 
 
 def _direction(measure: str) -> int:
+    """1 where more is better, -1 where less is, 0 where neither or unknown; a gain is better the larger it
+    is.
+    """
+    if measure.endswith("_gain"):
+        return 1
     if any(name in measure for name in LOWER_IS_BETTER):
         return -1
     return int(any(name in measure for name in HIGHER_IS_BETTER))
 
 
-def _group_rank(key: tuple[str, ...], lines: Mapping[tuple[str, ...], object]) -> int:
-    """Groups keep the order in which they first appear."""
-    groups = list(dict.fromkeys(other[:-1] for other in lines)) if len(key) > 1 else [key]
-    return groups.index(key[:-1]) if len(key) > 1 else 0
+def _group_rank(key: tuple[str, ...], lines: Mapping[tuple[str, ...], object]) -> tuple[int, int]:
+    """View groups in their own order, all others in the order in which they first appear."""
+    groups = list(dict.fromkeys(other[:-1] or other for other in lines))
+    known = GROUP_ORDER.index(key[0]) if key[0] in GROUP_ORDER else len(GROUP_ORDER)
+    return known, groups.index(key[:-1] or key)
 
 
 def _predictor_rank(name: str) -> int:
