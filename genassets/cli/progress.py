@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from genassets.pipeline.plan import Workflow
@@ -51,7 +52,7 @@ class ProgressDisplay:
     def step_started(self, step: StepRecord) -> None:
         """Begin the step's bar."""
         self._drop_step()
-        self._step = self._bars.add_task(step.key, total=None, message="")
+        self._step = self._bars.add_task(escape(step.key), total=None, message="")
         self._started = self._said = time.monotonic()
 
     def step_progress(self, step: StepRecord, done: float, total: float, message: str) -> None:
@@ -63,7 +64,8 @@ class ProgressDisplay:
             self._said = now
             left = (now - self._started) * (total - done) / done
             self.console.print(
-                f"  {step.key} {done:g}/{total:g}, about {left:.0f} s left {message}", soft_wrap=True
+                f"  {escape(step.key)} {done:g}/{total:g}, about {left:.0f} s left {escape(message)}",
+                soft_wrap=True,
             )
 
     def step_finished(self, step: StepRecord, stored: StoredObject | None) -> None:
@@ -71,7 +73,7 @@ class ProgressDisplay:
         self._drop_step()
         mark = "[blue]cached[/]" if step.cached else _MARKS.get(step.status, step.status)
         seconds = "" if step.cached else f" {step.seconds:.1f} s"
-        self.console.print(f"  {mark:<20} {step.key}{seconds}", soft_wrap=True)
+        self.console.print(f"  {mark:<20} {escape(step.key)}{seconds}", soft_wrap=True)
         if step.error:
             self.console.print(f"      {step.error}", style="red", markup=False, soft_wrap=True)
         if self._stages is not None:

@@ -12,6 +12,7 @@ from genassets.stages import (
     ingest,
     prepare_masks,
     reconstruct,
+    turntables,
 )
 from genassets.stages.stage import Stage
 
@@ -21,6 +22,7 @@ CATALOG: tuple[Stage, ...] = (
     filter_occlusion.STAGE,
     reconstruct.STAGE,
     evaluate_reconstruction.STAGE,
+    turntables.STAGE,
 )
 
 

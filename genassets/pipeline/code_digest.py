@@ -11,11 +11,21 @@ import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
+from genassets.errors import StageError
 from genassets.pipeline.file_digests import FileMemory
 
 PACKAGE = "genassets"
-# Message texts, the stage contract and the version carry no numbers; a change in them must not rerun stages.
-WITHOUT_EFFECT = frozenset({"genassets", "genassets.errors", "genassets.stages", "genassets.stages.stage"})
+# Message texts, the stage contract, the version and the fetching of files (whose bytes are pinned) carry no
+# numbers; a change in them must not rerun stages.
+WITHOUT_EFFECT = frozenset(
+    {
+        "genassets",
+        "genassets.errors",
+        "genassets.package_archive",
+        "genassets.stages",
+        "genassets.stages.stage",
+    }
+)
 
 
 def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> dict[str, str]:
@@ -48,6 +58,8 @@ def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> di
 
 def module_file(name: str, source_root: Path) -> Path | None:
     """File of a module or package, or None where the name is an attribute or lies outside the package."""
+    if name.partition(".")[0] != PACKAGE:
+        return None
     base = source_root.joinpath(*name.split("."))
     for path in (base.with_suffix(".py"), base / "__init__.py"):
         if path.is_file():
@@ -80,7 +92,10 @@ class _digest_and_imports:
 
     def __call__(self, path: Path) -> tuple[str, list[str]]:
         text = path.read_text(encoding="utf-8")
-        return code_digest_of(text), sorted(self._imports(ast.parse(text)))
+        try:
+            return code_digest_of(text), sorted(self._imports(ast.parse(text)))
+        except SyntaxError as error:
+            raise StageError(f"{path}:{error.lineno}: not valid Python: {error.msg}; correct it first") from error
 
     def _imports(self, tree: ast.Module) -> set[str]:
         found: set[str] = set()

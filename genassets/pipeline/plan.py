@@ -151,7 +151,7 @@ class Workflow:
     def _sources_of(self, step: Step) -> dict[str, str]:
         """Digests of what a step reads from outside the store: its log's files, files that its config names."""
         config = self.experiment.config(step.stage.name, step.shard)
-        sources: dict[str, str] = {}
+        sources = dict(step.stage.reads(config))
         for name in type(config).model_fields:
             value = getattr(config, name)
             if isinstance(value, PandasetSource):

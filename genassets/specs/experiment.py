@@ -90,18 +90,27 @@ def load_experiment(
 
 
 def build_experiment(
-    document: Document, configs: Mapping[str, type[BaseModel]], overrides: Sequence[str] = ()
+    document: Document,
+    configs: Mapping[str, type[BaseModel]],
+    overrides: Sequence[str] = (),
+    data_specs: Path | None = None,
 ) -> Experiment:
-    """As ``load_experiment``, from a document that was already read."""
+    """As ``load_experiment``, from a document that was already read.
+
+    Args:
+        data_specs: directory with datasets and profiles; ``data_specs_root()`` by default.
+    """
     given = [override_document(override) for override in overrides]
     chosen = [override for override in given if _chooses_file(override)]
     top = document
     for override in chosen:
         top = override.merged_over(top.without(next(iter(override.values))))
-    profile = _profile(top, configs)
+    profile = _profile(top, configs, data_specs)
     top = top.merged_over(profile) if profile is not None else top
     if isinstance(top.values.get("dataset"), str):
-        dataset = read_document(_display(find_spec("datasets", top.values["dataset"]))).nested("dataset")
+        dataset = read_document(_display(find_spec("datasets", top.values["dataset"], data_specs))).nested(
+            "dataset"
+        )
         top = dataset.merged_over(top.without("dataset"))
     for override in given:
         top = top if override in chosen else override.merged_over(top)
@@ -157,14 +166,16 @@ def _validated(document: Document, configs: Mapping[str, type[BaseModel]]) -> Ex
     return Experiment(header.model_copy(update={"dataset": resolved_dataset}), sources, sections, configs)
 
 
-def _profile(document: Document, configs: Mapping[str, type[BaseModel]]) -> Document | None:
+def _profile(
+    document: Document, configs: Mapping[str, type[BaseModel]], data_specs: Path | None
+) -> Document | None:
     name = document.values.get("profile", "laptop")
     if not (isinstance(name, str) and re.fullmatch(r"[a-z]+", name)):
         return None  # the header's validation names the mistake
     valid = ExperimentHeader.model_fields["profile"].annotation
     if name not in getattr(valid, "__args__", ()):
         return None
-    profile = read_document(_display(find_spec("profiles", name)))
+    profile = read_document(_display(find_spec("profiles", name, data_specs)))
     for key in profile.values:
         if key not in configs:
             raise unknown_key(key, configs, profile, (key,))

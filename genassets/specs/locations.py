@@ -24,11 +24,12 @@ def data_specs_root() -> Path:
     )
 
 
-def find_spec(kind: str, name: str) -> Path:
+def find_spec(kind: str, name: str, root: Path | None = None) -> Path:
     """The file of a spec given by name ("demo") or by path ("mine/demo.yaml").
 
     Args:
         kind: subdirectory of data_specs: "experiments", "datasets" or "profiles".
+        root: another directory of spec files than ``data_specs_root()``.
 
     Raises:
         SpecError: there is none; the message lists those that exist.
@@ -38,7 +39,7 @@ def find_spec(kind: str, name: str) -> Path:
         if not path.is_file():
             raise SpecError(f"{path}: no such file")
         return path
-    folder = data_specs_root() / kind
+    folder = (root or data_specs_root()) / kind
     path = folder / f"{name}.yaml"
     if not path.is_file():
         known = ", ".join(sorted(found.stem for found in folder.glob("*.yaml"))) or "none"

@@ -25,7 +25,12 @@ def validate(model: type[Model], values: Any, document: Document, at: KeyPath = 
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        messages = [_message(model, detail, document, at) for detail in error.errors(include_url=False)]
+        details = error.errors(include_url=False)
+        # Of a choice between a word and something else, the word is not what a list or mapping was meant as.
+        told = [
+            d for d in details if not (d["type"] == "literal_error" and isinstance(d["input"], list | dict))
+        ]
+        messages = [_message(model, detail, document, at) for detail in told or details]
         raise SpecError("\n".join(dict.fromkeys(messages))) from error
 
 
@@ -67,6 +72,8 @@ def _walk(model: type[BaseModel], loc: tuple[str | int, ...]) -> tuple[KeyPath, 
             candidates = _models_in(holder.model_fields[part].annotation)
         elif isinstance(part, int):
             path.append(part)
+        elif "[" in part:
+            continue  # pydantic's name for one branch of a union of plain types
         elif index == len(loc) - 1:
             owner = candidates[0] if candidates else None
             path.append(part)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.errors import StageError
 from genassets.specs.split import Split
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 
@@ -49,7 +50,12 @@ class EvaluateReconstructionConfig(BaseModel):
 def run(
     inputs: Inputs, config: EvaluateReconstructionConfig, out: Path, context: StageContext
 ) -> list[Metric]:
-    """Score every kept held-out observation of every log."""
+    """Score every kept held-out observation of every log.
+
+    Raises:
+        StageError: no training observation was kept, for example because no training frame has masks.
+        WeightsError: LPIPS is wanted and its pretrained file is not there.
+    """
     import pyarrow.parquet as pq
 
     from genassets.evaluation.lpips import Lpips
@@ -89,6 +95,11 @@ def run(
         scored += log_scored
         skipped += log_skipped
 
+    if scored and not training:
+        raise StageError(
+            "evaluate_reconstruction: no observation of a training frame was kept, so there are no baselines and "
+            "no view groups; let prepare_masks make masks of all frames (prepare_masks.frames: all)."
+        )
     table = observation_table(scored)
     observations: pd.DataFrame = table.to_pandas()
     pq.write_table(table, out / "observations.parquet")
@@ -115,7 +126,7 @@ def _observations(path: Path, split: Split) -> tuple[list[Observation], list[Obs
     training: list[Observation] = []
     held_out: list[Observation] = []
     for row in rows[rows["kept"]].itertuples(index=False):
-        frame, camera = int(row.frame), str(row.camera)
+        frame, camera = int(cast(int, row.frame)), str(row.camera)
         trains = split.is_training(frame)
         if camera not in split.train_cameras if trains else camera != split.camera:
             continue
@@ -220,10 +231,14 @@ STAGE = Stage(
     needs=("ingest", "filter_occlusion", "reconstruct"),
     modules=(
         "genassets.evaluation",
-        "genassets.curation.object_table",
+        "genassets.curation",
+        "genassets.masks",
+        "genassets.export",
         "genassets.reconstruction",
+        "genassets.rendering",
+        "genassets.fields",
         "genassets.driving",
-        "genassets.stages.ingest",
+        "genassets.geometry",
         "genassets.weights",
     ),
     run=run,

@@ -27,6 +27,9 @@ class Config(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     source: LogSource = Field(description="The log; filled in from the experiment's dataset.")
+    pictures: int = Field(
+        2, ge=0, description="Frames drawn with boxes and LiDAR over all cameras, spread over the log."
+    )
 
 
 def run(inputs: Inputs, config: Config, out: Path, context: StageContext) -> list[Metric]:
@@ -39,7 +42,7 @@ def run(inputs: Inputs, config: Config, out: Path, context: StageContext) -> lis
 
     source = config.source
     if isinstance(source, SyntheticSource):
-        from genassets.driving.synthetic import synthesize_log
+        from genassets.driving.synthetic.synthesize import synthesize_log
 
         synthesize_log(source.city, source.seed, source.name, out / "logs", progress=context.progress)
         location = f"logs/{source.name}"
@@ -49,6 +52,7 @@ def run(inputs: Inputs, config: Config, out: Path, context: StageContext) -> lis
     content = describe(log)
     _write_json(out / CONTENT_FILE, content)
     _write_json(out / LOG_FILE, {"name": source.name, "kind": source.kind, "path": location})
+    _draw(log, config.pictures, out)
     method = source.kind
     rows = [
         Metric("", "all", "all", "frames", log.frame_count, log.frame_count, method),
@@ -81,6 +85,24 @@ def describe(log: Log) -> dict[str, Any]:
     }
 
 
+def _draw(log: Log, count: int, out: Path) -> None:
+    """Sheets of all cameras with boxes and LiDAR: the check by eye of poses, times and axes."""
+    import numpy as np
+
+    from genassets.driving.overlay import draw_sheet
+    from genassets.export.picture_list import PictureList
+
+    pictures = PictureList(out)
+    frames = np.linspace(0, log.frame_count - 1, min(count, log.frame_count)).round().astype(int)
+    for frame in sorted({int(frame) for frame in frames}):
+        sheet = draw_sheet(log, frame, tile_width=480)
+        caption = (
+            "Boxes at each camera's own time; the front face is crossed. LiDAR from red (near) to blue (far)."
+        )
+        pictures.add(f"sensors_{frame:02d}", sheet, f"Log {log.name}, frame {frame}", caption)
+    pictures.write()
+
+
 def _write_json(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1, sort_keys=True) + "\n", encoding="utf-8")
 
@@ -90,7 +112,7 @@ STAGE = Stage(
     version=1,
     config=Config,
     needs=(),
-    modules=("genassets.driving", "genassets.geometry", "genassets.specs"),
+    modules=("genassets.driving", "genassets.export.picture_list", "genassets.geometry"),
     run=run,
     sharded=True,
     summary="Synthesize or check the driving log",

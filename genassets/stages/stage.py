@@ -77,6 +77,11 @@ class Inputs:
         return self.objects[stage]
 
 
+def _reads_nothing(config: Any) -> Mapping[str, str]:
+    """What a stage that reads only its inputs reads besides them."""
+    return {}
+
+
 def _ignore_progress(done: float, total: float, message: str) -> None:
     """Progress listener of a run that shows none."""
 
@@ -122,6 +127,8 @@ class Stage:
         runtime_only: config fields that change how fast the result comes, never the result.
         location_files: outputs that say where data lie, not what they are; when only these change, the
             stages that read this one don't run again.
+        reads: digests of what the result depends on besides inputs, config and code, by name: the
+            pretrained files, say. Files and logs that the config names are digested anyway.
         sharded: one output per log of the dataset instead of one over all.
     """
 
@@ -135,3 +142,4 @@ class Stage:
     summary: str
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()
+    reads: Callable[[Any], Mapping[str, str]] = field(default=_reads_nothing)
