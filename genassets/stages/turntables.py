@@ -92,10 +92,12 @@ def _true_turns(
         return {}
     turns = {}
     for azimuth, image in truth.turns(actor.actor_id).items():
-        pixels = image.astype(np.float32) / 255.0
+        pixels = image.astype(np.float32) / np.float32(255.0)
         pixels[..., :3] *= pixels[..., 3:]
-        pixels = cv2.resize(pixels, (resolution, resolution), interpolation=cv2.INTER_AREA)
-        turns[azimuth] = (pixels[..., :3], pixels[..., 3])
+        resized = np.asarray(
+            cv2.resize(pixels, (resolution, resolution), interpolation=cv2.INTER_AREA), dtype=np.float32
+        )
+        turns[azimuth] = (resized[..., :3], resized[..., 3])
     return turns
 
 
@@ -159,7 +161,14 @@ def _add_sheet(
     true_turns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]],
     shape: dict[str, object],
 ) -> None:
-    from genassets.export.turntable import colour_panel, depth_panel, on_paper, shape_panel, turntable_sheet
+    from genassets.export.turntable import (
+        colour_panel,
+        depth_panel,
+        filled_rows,
+        on_paper,
+        shape_panel,
+        turntable_sheet,
+    )
 
     rows = [
         ("model", [colour_panel(view) for view in views]),
@@ -168,6 +177,10 @@ def _add_sheet(
     ]
     if true_turns:
         rows.insert(0, ("truth", [on_paper(*true_turns[round(view.azimuth)]) for view in views]))
+    top, bottom = filled_rows(
+        [view.image.alpha for view in views] + [alpha for _, alpha in true_turns.values()]
+    )
+    rows = [(name, [panel[top:bottom] for panel in panels]) for name, panels in rows]
     azimuths = [view.azimuth for view in views]
     unseen = [f"{azimuth:g}" for azimuth in azimuths if not actor.has_seen(azimuth)]
     held_out = "no held-out view" if actor.psnr is None else f"held-out PSNR {actor.psnr:.1f} dB"
