@@ -11,6 +11,7 @@ from prefect.cache_policies import NO_CACHE
 from genassets.errors import GenAssetsError
 from genassets.pipeline.executor import Outcome
 
+RETRY_SECONDS = [2.0, 10.0]
 # A missing or forbidden file does not come back by trying again; a stale mount or a busy disk does.
 PERMANENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 
@@ -41,8 +42,8 @@ def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]
         task_run_name=key,
         cache_policy=NO_CACHE,
         persist_result=False,
-        retries=2,
-        retry_delay_seconds=[2, 10],
+        retries=len(RETRY_SECONDS),
+        retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=worth_retrying,
     )
     run(inputs=dict(inputs))
