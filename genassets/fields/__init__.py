@@ -1,0 +1,1 @@
+"""Neural fields: triplanes, the asset decoder, signed distance and feature networks, opacity."""

@@ -1,0 +1,58 @@
+"""The two networks behind a triplane look-up: signed distance first, view-dependent feature second."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class FeatureField(nn.Module):
+    """Triplane features to an SDF value, and with the view direction to a neural feature (paper eq. 1).
+
+    The two are called apart, so that the feature is computed only for the samples that are seen.
+    """
+
+    def __init__(self, inputs: int, hidden: int, features: int, direction_frequencies: int = 2) -> None:
+        super().__init__()
+        self.direction_frequencies = direction_frequencies
+        self.geometry = nn.Sequential(
+            nn.Linear(inputs, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, 1 + hidden),
+        )
+        self.appearance = nn.Sequential(
+            nn.Linear(hidden + 3 * (1 + 2 * direction_frequencies), hidden),
+            nn.ReLU(),
+            nn.Linear(hidden, features),
+        )
+        distance = self.geometry[-1]
+        assert isinstance(distance, nn.Linear)
+        with torch.no_grad():  # start at the shape prior: no distance of its own
+            distance.weight[0].zero_()
+            distance.bias[0].zero_()
+
+    def distance(
+        self, plane_features: Float[Tensor, "samples inputs"]
+    ) -> tuple[Float[Tensor, " samples"], Float[Tensor, "samples hidden"]]:
+        """Signed distance in metres, relative to the caller's shape prior, and the intermediate feature."""
+        out = self.geometry(plane_features)
+        return out[:, 0], out[:, 1:]
+
+    def feature(
+        self, intermediate: Float[Tensor, "samples hidden"], directions: Float[Tensor, "samples 3"]
+    ) -> Float[Tensor, "samples features"]:
+        """Neural feature seen along unit directions in the field's own frame."""
+        encoded = encode_directions(directions, self.direction_frequencies)
+        return self.appearance(torch.cat((F.relu(intermediate), encoded), dim=-1))
+
+
+def encode_directions(
+    directions: Float[Tensor, "samples 3"], frequencies: int
+) -> Float[Tensor, "samples channels"]:
+    """The directions with their sines and cosines at 1, 2, .. 2^(frequencies - 1) times pi / 2."""
+    angles = [directions * (torch.pi / 2 * 2**k) for k in range(frequencies)]
+    return torch.cat([directions, *(f(a) for a in angles for f in (torch.sin, torch.cos))], dim=-1)

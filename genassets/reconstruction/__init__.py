@@ -1,0 +1,1 @@
+"""Latents, decoder and fields learned from driving logs through occlusion-aware rendering."""

@@ -1,0 +1,35 @@
+"""The terms of the reconstruction objective (paper eq. 5) that this version uses."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def rgb_loss(rendered: Float[Tensor, "n 3 h w"], observed: Float[Tensor, "n 3 h w"]) -> Float[Tensor, ""]:
+    """Mean squared error of images in [0, 1]."""
+    return torch.mean((rendered - observed) ** 2)
+
+
+def lidar_loss(
+    rendered: Float[Tensor, " rays"], observed: Float[Tensor, " rays"], trim: float
+) -> Float[Tensor, ""]:
+    """Mean absolute distance error in metres, without the largest `trim` share of the batch.
+
+    Wrong labels and returns from things that nobody annotated are among the largest.
+    """
+    residual = (rendered - observed).abs()
+    kept = residual.numel() - int(trim * residual.numel())
+    if kept == 0:
+        return residual.sum()
+    return residual.topk(kept, largest=False).values.mean()
+
+
+def kl_loss(mean: Float[Tensor, "n c h w"], log_variance: Float[Tensor, "n c h w"]) -> Float[Tensor, ""]:
+    """KL divergence of the codes from a standard normal, summed over a code, averaged over actors.
+
+    1/2 sum(mu^2 + sigma^2 - 1 - log sigma^2). expm1 keeps it exact near log variance 0.
+    """
+    per_entry = 0.5 * (mean**2 + torch.expm1(log_variance) - log_variance)
+    return per_entry.sum() / max(len(mean), 1)

@@ -1,0 +1,137 @@
+"""Everything that reconstruction learns, in one module: latents, decoder, fields, backgrounds, image network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from genassets.driving.classes import CLASSES
+from genassets.fields.asset_decoder import AssetDecoder
+from genassets.fields.background import BackgroundPlanes
+from genassets.fields.feature_field import FeatureField
+from genassets.fields.opacity import Sharpness
+from genassets.reconstruction.settings import ModelSettings
+from genassets.rendering.occupancy import coarse_distance, prior_distance
+from genassets.rendering.renderer import ActorFields, BackgroundFields, CoarseActors
+from genassets.rendering.rgb_network import RgbNetwork
+from genassets.rendering.sampling import OccupancyGrid
+
+LATENT_SPREAD = 0.1
+LOG_VARIANCE_START = -4.0
+
+
+@dataclass(frozen=True)
+class Latents:
+    """Codes of some actors with the distribution that they were drawn from, each (n, channels, size, size)."""
+
+    code: Float[Tensor, "n c h w"]
+    mean: Float[Tensor, "n c h w"]
+    log_variance: Float[Tensor, "n c h w"]
+
+
+class AssetModel(nn.Module):
+    """Latents and class embeddings -> asset decoder -> triplanes -> fields, and a background a log.
+
+    sizes (actors, 3) are l, w, h in metres; class_index (actors,) points into CLASSES. Initial values come
+    from the seed alone.
+    """
+
+    sizes: Tensor
+    class_index: Tensor
+    coarse_distance: Tensor
+
+    def __init__(
+        self, settings: ModelSettings, sizes: Tensor, class_index: Tensor, logs: Sequence[str], seed: int
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.logs = tuple(logs)
+        generator = torch.Generator().manual_seed(seed)
+        actors = len(sizes)
+        shape = (settings.latent_channels, settings.latent_size, settings.latent_size)
+        width = settings.latent_channels * settings.latent_size**2
+        self.latent_shape = shape
+        # Sparse gradients: Adam then moves, and keeps the state of, only the codes that a step has met.
+        self.latent_mean = nn.Embedding(actors, width, sparse=True)
+        self.latent_log_variance = nn.Embedding(actors, width, sparse=True)
+        self.class_embedding = nn.Parameter(
+            LATENT_SPREAD * torch.randn(len(CLASSES), *shape, generator=generator)
+        )
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+            self.decoder = AssetDecoder(
+                settings.latent_channels, settings.decoder_channels, settings.plane_channels
+            )
+            self.field = FeatureField(3 * settings.plane_channels, settings.field_hidden, settings.features)
+            self.background_field = FeatureField(
+                3 * settings.background_plane_channels, settings.background_hidden, settings.features
+            )
+            self.rgb = RgbNetwork(
+                settings.features,
+                settings.rgb_channels,
+                settings.rgb_kernel,
+                settings.rgb_blocks,
+                settings.rgb_upsamplings,
+            )
+        self.beta = Sharpness()
+        self.background_beta = Sharpness()
+        self.backgrounds = nn.ModuleList(
+            BackgroundPlanes(settings.background_resolution, settings.background_plane_channels, generator)
+            for _ in logs
+        )
+        with torch.no_grad():
+            self.latent_mean.weight.copy_(LATENT_SPREAD * torch.randn(actors, width, generator=generator))
+            self.latent_log_variance.weight.fill_(LOG_VARIANCE_START)
+        self.register_buffer("sizes", sizes.float())
+        self.register_buffer("class_index", class_index.long())
+        self.register_buffer("coarse_distance", prior_distance(sizes.float(), settings.coarse_resolution))
+
+    @property
+    def stride(self) -> int:
+        """Image pixels along one side of a feature pixel."""
+        return 2**self.settings.rgb_upsamplings
+
+    def latents(self, actors: Int[Tensor, " n"], generator: torch.Generator | None = None) -> Latents:
+        """Codes of some actors: drawn with the reparameterisation mu + sigma eps, or the means without generator."""
+        mean = self.latent_mean(actors).reshape(-1, *self.latent_shape)
+        log_variance = self.latent_log_variance(actors).reshape(-1, *self.latent_shape)
+        if generator is None:
+            return Latents(mean, mean, log_variance)
+        noise = torch.randn(mean.shape, generator=generator, device=generator.device).to(mean.device)
+        return Latents(mean + torch.exp(0.5 * log_variance) * noise, mean, log_variance)
+
+    def decode(
+        self, actors: Int[Tensor, " n"], code: Float[Tensor, "n c h w"]
+    ) -> Float[Tensor, "n 3 channels height width"]:
+        """Triplanes of some actors from their codes and their classes' embeddings."""
+        return self.decoder(code, self.class_embedding[self.class_index[actors]])
+
+    def coarse_actors(self) -> CoarseActors:
+        """What culls samples and actors before anything is decoded."""
+        return CoarseActors(self.sizes, self.coarse_distance, self.beta().detach())
+
+    def refresh_coarse_distance(self, actor: int, fields: ActorFields) -> None:
+        """Take an actor's coarse distance from its decoded planes."""
+        self.coarse_distance[actor] = coarse_distance(fields, actor, self.settings.coarse_resolution)
+
+    def actor_fields(
+        self, actors: Int[Tensor, " n"], planes: Float[Tensor, "n 3 channels height width"]
+    ) -> ActorFields:
+        """The fields of decoded actors, as the renderer takes them."""
+        slot = torch.zeros(len(self.sizes), dtype=torch.long, device=self.sizes.device)
+        slot[actors] = torch.arange(len(actors), device=slot.device)
+        return ActorFields(self.field, self.beta(), planes, slot, self.sizes)
+
+    def background_fields(self, log: int, occupancy: OccupancyGrid) -> BackgroundFields:
+        """The background of a log, with its LiDAR occupancy."""
+        radius, height = self.settings.background_radius, self.settings.background_height
+        planes = self.backgrounds[log]
+        assert isinstance(planes, BackgroundPlanes)
+        scale = torch.tensor((radius, radius, height), device=self.sizes.device)
+        return BackgroundFields(
+            self.background_field, self.background_beta(), planes.planes, scale, occupancy
+        )

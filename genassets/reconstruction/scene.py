@@ -1,0 +1,178 @@
+"""A log as reconstruction sees it: a local frame, views at the rendered size, LiDAR rays, occupancy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from genassets.driving import Log
+from genassets.geometry.boxes import points_in_box
+from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
+from genassets.geometry.transforms import invert_pose, transform_directions
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SceneFrame:
+    """The world moved by `origin`, so that float32 resolves micrometres instead of centimetres.
+
+    log_root is where the log was read; origin (3,) in world metres.
+    """
+
+    log_name: str
+    log_root: Path
+    origin: Array
+
+    def pose(self, world_from_any: Array) -> Array:
+        """scene_from_any from world_from_any, (..., 4, 4)."""
+        moved = np.array(world_from_any, dtype=np.float64)
+        moved[..., :3, 3] -= self.origin
+        return moved
+
+
+@dataclass(frozen=True)
+class PlacedActors:
+    """Actors of one instant: library index (A,), scene_from_box (A, 4, 4), sizes (A, 3) as l, w, h."""
+
+    index: NDArray[np.int64]
+    scene_from_box: Array
+    sizes: Array
+
+    def select(self, keep: NDArray) -> PlacedActors:
+        return PlacedActors(self.index[keep], self.scene_from_box[keep], self.sizes[keep])
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera at one frame, at the rendered size, with the actors in the image.
+
+    bounds (A, 4): x0, y0, x1, y1 of each actor's box in pixels of the rendered image.
+    """
+
+    camera: str
+    frame: int
+    intrinsics: Intrinsics
+    scene_from_camera: Array
+    actors: PlacedActors
+    bounds: Array
+
+    def rays(self, pixels: Array) -> tuple[Array, Array]:
+        """Origins and unit directions (N, 3) in the scene frame of the rays through pixels (N, 2)."""
+        directions = transform_directions(self.scene_from_camera, pixel_directions(self.intrinsics, pixels))
+        return np.broadcast_to(self.scene_from_camera[:3, 3], directions.shape), directions
+
+    def actors_in(self, region: tuple[float, float, float, float]) -> PlacedActors:
+        """The actors whose bounds overlap a region (x0, y0, x1, y1) of the image."""
+        x0, y0, x1, y1 = region
+        b = self.bounds
+        return self.actors.select((b[:, 0] < x1) & (b[:, 2] > x0) & (b[:, 1] < y1) & (b[:, 3] > y0))
+
+
+@dataclass(frozen=True)
+class LidarSweepRays:
+    """Spinning-LiDAR rays of one sweep in the scene frame: origin (3,), directions (N, 3), distances (N,).
+
+    actor (N,) is the library index of the actor whose padded box holds the return, -1 for none.
+    """
+
+    frame: int
+    origin: Array
+    direction: Array
+    distance: Array
+    actor: NDArray[np.int64]
+    actors: PlacedActors
+
+
+def scene_frame(log: Log) -> SceneFrame:
+    """The scene frame of a log: at the middle of the ego car's way."""
+    return SceneFrame(log.name, log.root, log.world_from_ego[:, :3, 3].mean(axis=0))
+
+
+def rendered_intrinsics(stored: Intrinsics, scale: float, stride: int) -> Intrinsics:
+    """The stored camera at `scale`, both sides rounded to multiples of `stride`, at least one."""
+    sides = [max(1, round(side * scale / stride)) * stride for side in (stored.width, stored.height)]
+    return stored.resized(*sides)
+
+
+def placed_actors(
+    log: Log, frame: int, time: float, index: Mapping[str, int], scene: SceneFrame
+) -> PlacedActors:
+    """The log's actors that have an index, as they stand at a time within a frame."""
+    tracks = [track for track in log.tracks if track.actor_id in index and track.covers(frame)]
+    poses = [scene.pose(track.pose_at(time)) for track in tracks]
+    return PlacedActors(
+        np.array([index[track.actor_id] for track in tracks], dtype=np.int64),
+        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
+        np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3),
+    )
+
+
+def make_view(
+    log: Log, camera: str, frame: int, index: Mapping[str, int], scene: SceneFrame, scale: float, stride: int
+) -> View:
+    """The view of a camera at a frame, with moving actors where they are at the camera's own time stamp."""
+    stream = log.cameras[camera]
+    intrinsics = rendered_intrinsics(stream.intrinsics, scale, stride)
+    actors = placed_actors(log, frame, float(stream.times[frame]), index, scene)
+    scene_from_camera = scene.pose(stream.world_from_camera[frame])
+    camera_from_scene = invert_pose(scene_from_camera)
+    projections = [
+        project_box(intrinsics, camera_from_scene @ pose, size)
+        for pose, size in zip(actors.scene_from_box, actors.sizes, strict=True)
+    ]
+    visible = np.array([projection is not None for projection in projections], dtype=bool)
+    bounds = np.array([p.bounds for p in projections if p is not None], dtype=np.float64).reshape(-1, 4)
+    return View(camera, frame, intrinsics, scene_from_camera, actors.select(visible), bounds)
+
+
+def load_image(log: Log, view: View) -> NDArray[np.uint8]:
+    """The view's image (H, W, 3), uint8 RGB, averaged down to the rendered size."""
+    image = log.cameras[view.camera].image(view.frame)
+    size = (view.intrinsics.width, view.intrinsics.height)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def lidar_rays(
+    log: Log,
+    frame: int,
+    index: Mapping[str, int],
+    scene: SceneFrame,
+    farthest: float,
+    padding: Sequence[float],
+) -> LidarSweepRays:
+    """Rays of a sweep's spinning LiDAR up to `farthest` metres.
+
+    The forward LiDAR is left out: PandaSet gives no pose of it, so its rays' origins are not known.
+    """
+    sweep = log.sweep(frame)
+    origin = scene.pose(sweep.world_from_lidar)[:3, 3]
+    points = sweep.points[sweep.sensor == 0] - scene.origin
+    offset = points - origin
+    distance = np.linalg.norm(offset, axis=1)
+    keep = (distance > 0.5) & (distance < farthest)
+    points, offset, distance = points[keep], offset[keep], distance[keep]
+    actors = placed_actors(log, frame, float(log.frame_times[frame]), index, scene)
+    owner = np.full(len(points), -1, dtype=np.int64)
+    for row, (pose, size) in enumerate(zip(actors.scene_from_box, actors.sizes, strict=True)):
+        owner[points_in_box(points, pose, size, padding)] = actors.index[row]
+    return LidarSweepRays(frame, origin, offset / distance[:, None], distance, owner, actors)
+
+
+def static_points(log: Log, frames: Iterable[int], scene: SceneFrame, padding: Sequence[float]) -> Array:
+    """LiDAR points (N, 3) of some frames in the scene frame, without those inside moving actors' boxes."""
+    kept = [np.zeros((0, 3))]
+    for frame in frames:
+        points = log.sweep(frame).points
+        moving = np.zeros(len(points), dtype=bool)
+        for track in log.tracks:
+            if not track.stationary and track.covers(frame):
+                pose = track.pose_at(float(log.frame_times[frame]))
+                moving |= points_in_box(points, pose, track.size, padding)
+        kept.append(points[~moving] - scene.origin)
+    return np.concatenate(kept)

@@ -1,0 +1,163 @@
+"""Pictures from an asset library: whole scenes as a camera saw them, and single actors from anywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from genassets.driving import Log
+from genassets.geometry.cameras import Intrinsics, pixel_centres, pixel_directions
+from genassets.geometry.transforms import transform_directions
+from genassets.reconstruction.library import AssetLibrary, load_library
+from genassets.reconstruction.scene import View, make_view, rendered_intrinsics
+from genassets.reconstruction.training import render_settings
+from genassets.reconstruction.training_data import region_rays
+from genassets.rendering.occupancy import cell_centres
+from genassets.rendering.rays import cast_rays
+from genassets.rendering.renderer import ActorFields, actor_distance, cull, padded_half_size, render_rays
+
+RAYS_AT_ONCE = 8192
+CONTEXT = 4
+"""Feature pixels rendered around a region, so that the image network sees no border inside it."""
+
+
+@dataclass(frozen=True)
+class ActorView:
+    """One actor alone: rgb (H, W, 3) in [0, 1] on black, alpha (H, W), depth (H, W) in metres along the ray."""
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+class SceneRenderer:
+    """Renders logs and actors of a library; keeps the planes of the last actors that it decoded."""
+
+    def __init__(self, library: AssetLibrary, exact: bool = False) -> None:
+        self.library = library
+        self._settings = render_settings(library.settings.rendering, exact)
+        self._planes = lru_cache(maxsize=256)(self._decode)
+
+    @classmethod
+    def load(cls, path: Path) -> SceneRenderer:
+        """The renderer of a library on disk."""
+        return cls(load_library(path))
+
+    @property
+    def assets(self) -> pd.DataFrame:
+        """log, actor_id, actor_class, size_l, size_w, size_h (metres), observations of every actor."""
+        return self.library.assets
+
+    def render_intrinsics(self, log: Log, camera: str) -> Intrinsics:
+        """The camera at the size at which its images are rendered and compared."""
+        stored = log.cameras[camera].intrinsics
+        return rendered_intrinsics(stored, self.library.settings.image_scale, self.library.model.stride)
+
+    def view(self, log: Log, camera: str, frame: int) -> View:
+        """The view of a camera at a frame with the library's actors in it."""
+        index = self.library.indices_of_log(log.name)
+        scene = self.library.scenes[log.name]
+        scale, stride = self.library.settings.image_scale, self.library.model.stride
+        return make_view(log, camera, frame, index, scene, scale, stride)
+
+    @torch.no_grad()
+    def render_image(
+        self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
+    ) -> NDArray[np.float32]:
+        """The composited scene (h, w, 3) in [0, 1], in a region x0, y0, x1, y1 of the rendered image."""
+        view = self.view(log, camera, frame)
+        x0, y0, x1, y1 = region or (0, 0, view.intrinsics.width, view.intrinsics.height)
+        stride = self.library.model.stride
+        fx0, fy0 = x0 // stride - CONTEXT, y0 // stride - CONTEXT
+        fx1, fy1 = -(-x1 // stride) + CONTEXT, -(-y1 // stride) + CONTEXT
+        rows_at_once = max(1, RAYS_AT_ONCE // (fx1 - fx0))
+        background = self.library.model.background_fields(
+            self.library.model.logs.index(log.name), self.library.occupancy[log.name]
+        )
+        coarse = self.library.model.coarse_actors()
+        strips = []
+        for top in range(fy0, fy1, rows_at_once):
+            rays = region_rays(view, (fx0, top, fx1, min(top + rows_at_once, fy1)), stride)
+            culled = cull(rays, coarse, self._settings)
+            fields = self._fields(culled.actors(rays).tolist())
+            strips.append(render_rays(rays, culled, fields, background, self._settings).feature)
+        feature_map = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
+        image = self.library.model.rgb(feature_map)[0].permute(1, 2, 0).numpy()
+        left, top = x0 - fx0 * stride, y0 - fy0 * stride
+        return image[top : top + y1 - y0, left : left + x1 - x0]
+
+    @torch.no_grad()
+    def render_actor(
+        self, log_name: str, actor_id: str, intrinsics: Intrinsics, box_from_camera: ArrayLike
+    ) -> ActorView:
+        """One actor without its scene, at the image size of the given camera.
+
+        Feature rays run one for each stride x stride pixels, as in training; alpha and depth are enlarged.
+        """
+        actor = self.library.index_of(log_name, actor_id)
+        stride = self.library.model.stride
+        width, height = -(-intrinsics.width // stride), -(-intrinsics.height // stride)
+        pixels = pixel_centres(-CONTEXT, -CONTEXT, width + CONTEXT, height + CONTEXT) * stride
+        directions = transform_directions(box_from_camera, pixel_directions(intrinsics, pixels))
+        origins = np.broadcast_to(np.asarray(box_from_camera)[:3, 3], directions.shape)
+        size = self.assets.loc[actor, ["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
+        fields = self._fields([actor])
+        parts = []
+        for start in range(0, len(origins), RAYS_AT_ONCE):
+            chunk = slice(start, start + RAYS_AT_ONCE)
+            rays = cast_rays(origins[chunk], directions[chunk], [actor], np.eye(4)[None], size[None])
+            culled = cull(rays, self.library.model.coarse_actors(), self._settings)
+            out = render_rays(rays, culled, fields, None, self._settings)
+            parts.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
+        grid = (1, height + 2 * CONTEXT, width + 2 * CONTEXT, -1)
+        maps = torch.cat(parts).reshape(grid).permute(0, 3, 1, 2)
+        feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
+        rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3))
+        alpha, distance = (
+            torch.nn.functional.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False)
+            for m in (alpha, distance)
+        )
+        margin = CONTEXT * stride
+
+        def crop(image: Tensor) -> NDArray[np.float32]:
+            inside = image[0, :, margin : margin + intrinsics.height, margin : margin + intrinsics.width]
+            return inside.permute(1, 2, 0).numpy()
+
+        opacity = crop(alpha)
+        depth = crop(distance) / np.maximum(opacity, 1e-6)
+        return ActorView(crop(rgb) * opacity, opacity[..., 0], depth[..., 0])
+
+    @torch.no_grad()
+    def actor_sdf(
+        self, log_name: str, actor_id: str, resolution: int
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.float64]]:
+        """Signed distance (R, R, R) in metres over an actor's padded box, in its box frame.
+
+        Returns the grid, the position (3,) of its first value and the spacing (3,) between values.
+        """
+        actor = self.library.index_of(log_name, actor_id)
+        fields = self._fields([actor])
+        half = padded_half_size(self.library.model.sizes)[actor]
+        position = cell_centres(resolution) * half
+        index = torch.full((RAYS_AT_ONCE,), actor)
+        parts = [actor_distance(p, index[: len(p)], fields)[0] for p in position.split(RAYS_AT_ONCE)]
+        grid = torch.cat(parts).reshape(resolution, resolution, resolution)
+        spacing = (2 * half / resolution).double().numpy()
+        return grid.numpy(), position[0].double().numpy(), spacing
+
+    def _fields(self, actors: list[int]) -> ActorFields:
+        """Fields of some actors, each decoded once."""
+        planes = torch.stack([self._planes(actor) for actor in actors])
+        return self.library.model.actor_fields(torch.tensor(actors), planes)
+
+    def _decode(self, actor: int) -> Float[Tensor, "3 channels height width"]:
+        index = torch.tensor([actor])
+        return self.library.model.decode(index, self.library.model.latents(index).code)[0]

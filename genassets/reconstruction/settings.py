@@ -1,0 +1,120 @@
+"""Every size, rate and weight of reconstruction; the profiles in data_specs/profiles give them values."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+PositiveInt = Annotated[int, Field(gt=0)]
+PositiveFloat = Annotated[float, Field(gt=0)]
+Weight = Annotated[float, Field(ge=0)]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ModelSettings(_Settings):
+    """Sizes of latents, decoder, fields and image network."""
+
+    latent_size: PositiveInt = 8
+    latent_channels: PositiveInt = 16
+    decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)
+    plane_channels: PositiveInt = 8
+    field_hidden: PositiveInt = 48
+    features: PositiveInt = 16
+    background_resolution: PositiveInt = 192
+    background_plane_channels: PositiveInt = 8
+    background_hidden: PositiveInt = 32
+    background_radius: PositiveFloat = 60.0
+    background_height: PositiveFloat = 15.0
+    rgb_channels: PositiveInt = 24
+    rgb_kernel: PositiveInt = 3
+    rgb_blocks: PositiveInt = 3
+    rgb_upsamplings: Annotated[int, Field(ge=0, le=2)] = 1
+    coarse_resolution: PositiveInt = 32
+
+    @property
+    def plane_size(self) -> int:
+        """Texels along one side of an actor's planes."""
+        return self.latent_size * 2 ** (len(self.decoder_channels) - 1)
+
+    @model_validator(mode="after")
+    def _blocks_fit(self) -> ModelSettings:
+        if self.rgb_kernel % 2 == 0:
+            raise ValueError(f"rgb_kernel is {self.rgb_kernel}: an odd number is needed")
+        if self.rgb_blocks < 2 * self.rgb_upsamplings:
+            raise ValueError(
+                f"rgb_blocks is {self.rgb_blocks}: {self.rgb_upsamplings} upsamplings need twice as many blocks"
+            )
+        return self
+
+
+class RenderingSettings(_Settings):
+    """Sampling along rays. Lengths in metres."""
+
+    actor_step: PositiveFloat = 0.10
+    actor_growth: Weight = 0.005
+    background_step: PositiveFloat = 0.80
+    background_growth: Weight = 0.08
+    background_near: PositiveFloat = 1.0
+    background_far: PositiveFloat = 80.0
+    sky_samples: Annotated[int, Field(ge=1)] = 8
+    weight_threshold: Annotated[float, Field(ge=0, lt=1)] = 3e-3
+    occupancy_cell: PositiveFloat = 0.5
+    occupancy_dilation: Annotated[int, Field(ge=0)] = 1
+    coarse_refresh: PositiveInt = Field(
+        2, description="steps between refreshes of one actor's coarse distance"
+    )
+
+
+class LearningRates(_Settings):
+    """Adam's rates at the start; all fall along a half cosine to `final` times their start."""
+
+    latent: PositiveFloat = 0.05
+    decoder: PositiveFloat = 1e-3
+    field: PositiveFloat = 2e-3
+    sharpness: PositiveFloat = 0.05
+    background: PositiveFloat = 1e-2
+    rgb: PositiveFloat = 2e-3
+    final: Annotated[float, Field(gt=0, le=1)] = 0.05
+
+
+class LossWeights(_Settings):
+    """Weights of the objective (paper, "Training Details")."""
+
+    rgb: Weight = 1.0
+    lidar: Weight = 0.01
+    kl: Weight = 1e-5
+
+
+class ReconstructionSettings(_Settings):
+    """One reconstruction: what is rendered, with which model, for how long."""
+
+    image_scale: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.25, description="size of rendered images as a share of the log's images"
+    )
+    steps: PositiveInt = 1500
+    patches: PositiveInt = 8
+    views_at_once: PositiveInt = Field(2, description="views that the patches of a step come from")
+    patch_size: PositiveInt = Field(24, description="side of a training patch in feature pixels")
+    patch_margin: Annotated[int, Field(ge=0)] = Field(
+        2, description="feature pixels rendered around a patch as context for the image network"
+    )
+    background_share: Annotated[float, Field(ge=0, le=1)] = Field(
+        0.15, description="share of patches placed anywhere in an image rather than on an actor"
+    )
+    lidar_rays: Annotated[int, Field(ge=0)] = 512
+    lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.05, description="share of the largest LiDAR residuals left out of a batch"
+    )
+    smallest_actor: PositiveInt = Field(
+        8,
+        description="pixels, in the rendered image, that the longer side of an actor's box must have to be learned",
+    )
+    checkpoint_every: PositiveInt = 200
+    model: ModelSettings = ModelSettings()
+    rendering: RenderingSettings = RenderingSettings()
+    rates: LearningRates = LearningRates()
+    weights: LossWeights = LossWeights()

@@ -1,0 +1,228 @@
+"""Joint learning of latents, decoder, fields, backgrounds and image network (paper section 3.2)."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+from torch import Tensor
+
+from genassets.errors import StageError
+from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss
+from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
+from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
+from genassets.rendering.renderer import RenderSettings, SampleCounts, cull, render_rays
+
+CURVE_EVERY = 20
+
+Progress = Callable[[float, float, str], None]
+Curve = Callable[[str, int, float], None]
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The terms of one step, unweighted, and the actors that it met."""
+
+    losses: dict[str, Tensor]
+    actors: Tensor
+    counts: SampleCounts
+
+
+def render_settings(settings: RenderingSettings, exact: bool = False) -> RenderSettings:
+    """The renderer's settings from those of the spec."""
+    return RenderSettings(
+        settings.actor_step,
+        settings.actor_growth,
+        settings.background_step,
+        settings.background_growth,
+        settings.background_near,
+        settings.background_far,
+        settings.sky_samples,
+        settings.weight_threshold,
+        exact,
+    )
+
+
+class Trainer:
+    """Model, optimisers and step counter; everything random in a step comes from (seed, step).
+
+    That makes a run that was killed and resumed from a checkpoint equal to one that was not.
+    """
+
+    def __init__(
+        self, model: AssetModel, data: Sequence[TrainingLog], settings: ReconstructionSettings, seed: int
+    ):
+        self.model, self.data, self.settings, self.seed = model, data, settings, seed
+        self.step = 0
+        self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
+        rates = settings.rates
+        groups = parameter_groups(model, rates)
+        self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        codes = [model.latent_mean.weight, model.latent_log_variance.weight]
+        self.sparse = torch.optim.SparseAdam([{"params": codes, "lr": rates.latent}], betas=(0.9, 0.99))
+        self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
+        views = np.array([max(len(log.observations), 1) for log in data], dtype=np.float64)
+        self.log_chance = views / views.sum()
+
+    def advance(self) -> StepResult:
+        """One optimisation step.
+
+        Raises:
+            StageError: a loss is not finite; names term, step and actors. Nothing was changed by the step.
+        """
+        rng = np.random.default_rng([self.seed, self.step])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        number = int(rng.choice(len(self.data), p=self.log_chance))
+        batch = draw_batch(self.data[number], self.settings, self.model.stride, rng)
+        result = self.losses(number, batch, generator)
+        weights = self.settings.weights.model_dump()
+        for term, value in result.losses.items():
+            if not torch.isfinite(value):
+                raise StageError(
+                    f"reconstruct: the loss term {term!r} is {value.item()} at step {self.step} "
+                    f"(log {self.data[number].scene.log_name}, actors {result.actors.tolist()}); training stopped. "
+                    "The last checkpoint is kept: lower the learning rates and run again."
+                )
+        total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
+        self._set_rates()
+        self.dense.zero_grad(set_to_none=True)
+        self.sparse.zero_grad(set_to_none=True)
+        total.backward()
+        self.dense.step()
+        self.sparse.step()
+        self.step += 1
+        return result
+
+    def losses(self, number: int, batch: Batch, generator: torch.Generator | None) -> StepResult:
+        """Render a batch of log `number` and compare it with what was observed."""
+        model, settings = self.model, self.settings
+        rendering = render_settings(settings.rendering)
+        culled = cull(batch.rays, model.coarse_actors(), rendering, generator)
+        actors = culled.actors(batch.rays)
+        latents = model.latents(actors, generator)
+        fields = model.actor_fields(actors, model.decode(actors, latents.code))
+        if self.step % settings.rendering.coarse_refresh == 0:
+            stalest = int(actors[self.refreshed[actors].argmin()])
+            model.refresh_coarse_distance(stalest, fields)
+            self.refreshed[stalest] = self.step + 1
+        background = model.background_fields(number, self.data[number].occupancy)
+        rendered = render_rays(batch.rays, culled, fields, background, rendering, generator)
+        camera_rays = batch.patches * batch.side**2
+        feature_map = rendered.feature[:camera_rays].reshape(batch.patches, batch.side, batch.side, -1)
+        margin = settings.patch_margin * model.stride
+        image = model.rgb(feature_map.permute(0, 3, 1, 2))
+        height, width = image.shape[-2:]
+        image = image[..., margin : height - margin, margin : width - margin]
+        losses = {"rgb": rgb_loss(image, batch.pixels), "kl": kl_loss(latents.mean, latents.log_variance)}
+        if len(batch.lidar_distance):
+            distance = rendered.distance[camera_rays:]
+            losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
+        return StepResult(losses, actors, rendered.counts)
+
+    def _set_rates(self) -> None:
+        final = self.settings.rates.final
+        share = final + (1 - final) * 0.5 * (1 + math.cos(math.pi * self.step / self.settings.steps))
+        for optimiser, rates in zip((self.dense, self.sparse), self.base_rates, strict=True):
+            for group, rate in zip(optimiser.param_groups, rates, strict=True):
+                group["lr"] = rate * share
+
+    @torch.no_grad()
+    def refresh_coarse_distance(self) -> None:
+        """Coarse distance of every actor from its mean code, as the finished model uses it."""
+        for start in range(0, len(self.model.sizes), 16):
+            actors = torch.arange(start, min(start + 16, len(self.model.sizes)))
+            fields = self.model.actor_fields(
+                actors, self.model.decode(actors, self.model.latents(actors).code)
+            )
+            for actor in actors.tolist():
+                self.model.refresh_coarse_distance(actor, fields)
+
+    def state(self) -> dict[str, Any]:
+        """Everything that the next steps depend on."""
+        return {
+            "step": self.step,
+            "refreshed": self.refreshed,
+            "model": self.model.state_dict(),
+            "dense": self.dense.state_dict(),
+            "sparse": self.sparse.state_dict(),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from a state."""
+        self.step = int(state["step"])
+        self.refreshed = state["refreshed"]
+        self.model.load_state_dict(state["model"])
+        self.dense.load_state_dict(state["dense"])
+        self.sparse.load_state_dict(state["sparse"])
+
+
+def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
+    """The dense parameters with their learning rates."""
+    decoder = [*model.decoder.parameters(), model.class_embedding]
+    fields = [*model.field.parameters(), *model.background_field.parameters()]
+    sharpness = [*model.beta.parameters(), *model.background_beta.parameters()]
+    return [
+        {"params": decoder, "lr": rates.decoder},
+        {"params": fields, "lr": rates.field},
+        {"params": sharpness, "lr": rates.sharpness},
+        {"params": list(model.backgrounds.parameters()), "lr": rates.background},
+        {"params": list(model.rgb.parameters()), "lr": rates.rgb},
+    ]
+
+
+def build_model(
+    assets: pd.DataFrame, logs: Sequence[str], settings: ReconstructionSettings, seed: int
+) -> AssetModel:
+    """An untrained model for a table of assets."""
+    from genassets.driving.classes import CLASSES
+
+    sizes = torch.tensor(assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64))
+    classes = torch.tensor([CLASSES.index(name) for name in assets["actor_class"]], dtype=torch.long)
+    return AssetModel(settings.model, sizes, classes, logs, seed)
+
+
+def train(
+    model: AssetModel,
+    data: Sequence[TrainingLog],
+    settings: ReconstructionSettings,
+    seed: int,
+    work_dir: Path,
+    progress: Progress,
+    curve: Curve,
+) -> None:
+    """Train the model in place, from the checkpoint in work_dir where there is one."""
+    trainer = Trainer(model, data, settings, seed)
+    checkpoint = work_dir / "checkpoint.pt"
+    if checkpoint.exists():
+        trainer.restore(torch.load(checkpoint, weights_only=True))
+    while trainer.step < settings.steps:
+        result = trainer.advance()
+        step = trainer.step
+        if step % CURVE_EVERY == 0 or step == settings.steps:
+            for term, value in result.losses.items():
+                curve(f"loss/{term}", step, float(value))
+            psnr = -10 * math.log10(max(float(result.losses["rgb"]), 1e-10))
+            curve("training/patch_psnr", step, psnr)
+            curve("training/samples_shaded", step, result.counts.shaded)
+            progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
+        if step % settings.checkpoint_every == 0 and step < settings.steps:
+            save_checkpoint(trainer, checkpoint)
+    trainer.refresh_coarse_distance()
+
+
+def save_checkpoint(trainer: Trainer, path: Path) -> None:
+    """Write a checkpoint whole or not at all."""
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        torch.save(trainer.state(), file)
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)

@@ -1,0 +1,277 @@
+"""What reconstruction trains on: observed images and LiDAR sweeps, and the table of actors that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from genassets.driving import Log
+from genassets.errors import StageError
+from genassets.geometry.cameras import pixel_centres
+from genassets.reconstruction.scene import (
+    LidarSweepRays,
+    SceneFrame,
+    View,
+    lidar_rays,
+    load_image,
+    make_view,
+    scene_frame,
+    static_points,
+)
+from genassets.reconstruction.settings import ReconstructionSettings
+from genassets.rendering.occupancy import background_occupancy
+from genassets.rendering.rays import BOX_PADDING, Rays, cast_rays, concatenate_rays
+from genassets.rendering.sampling import OccupancyGrid
+
+LIDAR_SHARE_ON_ACTORS = 0.75
+"""Share of a batch's LiDAR rays that end on an actor; the rest keeps the background in place."""
+
+LIDAR_BEHIND = 2.0
+"""Metres that a LiDAR ray is followed beyond its return: weight found there is an error to learn from."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """An actor in a training view: bounds x0, y0, x1, y1 in pixels of the rendered image."""
+
+    view: int
+    actor: int
+    bounds: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class TrainingLog:
+    """One log's share of the training data."""
+
+    scene: SceneFrame
+    views: list[View]
+    images: list[UInt8[Tensor, "height width 3"]]
+    observations: list[Observation]
+    lidar: list[LidarSweepRays]
+    occupancy: OccupancyGrid
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays of one step: first patches x side x side camera rays, then LiDAR rays, with what was observed.
+
+    pixels (patches, 3, h, w) in [0, 1]; lidar_distance (rays,) in metres.
+    """
+
+    rays: Rays
+    patches: int
+    side: int
+    pixels: Float[Tensor, "patches 3 h w"]
+    lidar_distance: Float[Tensor, " lidar"]
+
+
+def training_frames(
+    log: Log, cameras: Sequence[str], is_training: Callable[[int], bool]
+) -> list[tuple[str, int]]:
+    """The (camera, frame) pairs that train: those of the split whose image is there."""
+    return [
+        (name, frame)
+        for name in cameras
+        if name in log.cameras
+        for frame in range(log.frame_count)
+        if is_training(frame) and log.cameras[name].image_paths[frame] is not None
+    ]
+
+
+def prepare_training(
+    logs: Sequence[Log],
+    cameras: Sequence[str],
+    is_training: Callable[[int], bool],
+    settings: ReconstructionSettings,
+    stride: int,
+) -> tuple[pd.DataFrame, list[TrainingLog]]:
+    """The table of learnable actors and, for each log, its views, sweeps and occupancy.
+
+    An actor is learnable once a training view shows it with at least `smallest_actor` pixels. Columns: log,
+    actor_id, actor_class, size_l, size_w, size_h (metres), observations.
+
+    Raises:
+        StageError: no training view shows any actor.
+    """
+    tables, prepared = [], []
+    offset = 0
+    for log in logs:
+        scene = scene_frame(log)
+        everyone = {track.actor_id: number for number, track in enumerate(log.tracks)}
+        shots = training_frames(log, cameras, is_training)
+        views = [make_view(log, name, f, everyone, scene, settings.image_scale, stride) for name, f in shots]
+        seen = np.zeros(len(log.tracks), dtype=np.int64)
+        for view in views:
+            np.add.at(seen, view.actors.index[_large_enough(view, settings.smallest_actor)], 1)
+        learnable = np.flatnonzero(seen)
+        table = _asset_table(log, learnable, seen)
+        index = {actor_id: offset + row for row, actor_id in enumerate(table["actor_id"])}
+        tables.append(table)
+        prepared.append(_training_log(log, shots, index, scene, settings, stride, is_training))
+        offset += len(table)
+    assets = pd.concat(tables, ignore_index=True)
+    if assets.empty:
+        names = ", ".join(log.name for log in logs) or "none"
+        raise StageError(
+            f"reconstruct: no training view of the logs ({names}) shows an actor of at least "
+            f"{settings.smallest_actor} pixels; expected tracked boxes in view of {', '.join(cameras)}. "
+            "Choose other logs or cameras, a larger image_scale, or a smaller smallest_actor."
+        )
+    return assets, prepared
+
+
+def _asset_table(log: Log, learnable: np.ndarray, seen: np.ndarray) -> pd.DataFrame:
+    tracks = [log.tracks[number] for number in learnable]
+    sizes = np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3)
+    return pd.DataFrame(
+        {
+            "log": pd.Series([log.name] * len(tracks), dtype=object),
+            "actor_id": pd.Series([track.actor_id for track in tracks], dtype=object),
+            "actor_class": pd.Series([track.actor_class for track in tracks], dtype=object),
+            "size_l": sizes[:, 0],
+            "size_w": sizes[:, 1],
+            "size_h": sizes[:, 2],
+            "observations": seen[learnable],
+        }
+    )
+
+
+def _training_log(
+    log: Log,
+    shots: Sequence[tuple[str, int]],
+    index: Mapping[str, int],
+    scene: SceneFrame,
+    settings: ReconstructionSettings,
+    stride: int,
+    is_training: Callable[[int], bool],
+) -> TrainingLog:
+    views = [make_view(log, name, f, index, scene, settings.image_scale, stride) for name, f in shots]
+    observations = [
+        Observation(number, int(view.actors.index[row]), tuple(view.bounds[row].tolist()))
+        for number, view in enumerate(views)
+        for row in np.flatnonzero(_large_enough(view, settings.smallest_actor))
+    ]
+    render, model = settings.rendering, settings.model
+    frames = [frame for frame in range(log.frame_count) if is_training(frame) and log.has_sweep(frame)]
+    sweeps = [lidar_rays(log, f, index, scene, render.background_far, BOX_PADDING) for f in frames]
+    occupancy = background_occupancy(
+        static_points(log, frames, scene, BOX_PADDING),
+        render.occupancy_cell,
+        render.occupancy_dilation,
+        render.background_far + model.background_radius,
+        2 * model.background_height,
+    )
+    images = [torch.from_numpy(load_image(log, view)) for view in views]
+    return TrainingLog(scene, views, images, observations, sweeps, occupancy)
+
+
+def _large_enough(view: View, smallest: int) -> np.ndarray:
+    sides = view.bounds[:, 2:] - view.bounds[:, :2]
+    return sides.max(axis=1, initial=0.0) >= smallest
+
+
+def draw_batch(
+    data: TrainingLog, settings: ReconstructionSettings, stride: int, rng: np.random.Generator
+) -> Batch:
+    """Patches on and around actors, some anywhere, and LiDAR rays of one sweep.
+
+    All patches come from `views_at_once` views, so that they share decoded actors. Views and observations are
+    drawn in proportion to the square root of the observations' areas: large ones hold more detail, small
+    ones are many.
+    """
+    side = settings.patch_size + 2 * settings.patch_margin
+    parts, targets = [], []
+    area = np.array([max(1.0, (b[2] - b[0]) * (b[3] - b[1])) for b in (o.bounds for o in data.observations)])
+    chance = np.sqrt(area)
+    owner = np.array([o.view for o in data.observations], dtype=np.int64)
+    of_view = np.bincount(owner, chance, minlength=len(data.views)) + 1e-9
+    count = min(settings.views_at_once, len(data.views))
+    chosen = rng.choice(len(data.views), count, replace=False, p=of_view / of_view.sum())
+    for patch in range(settings.patches):
+        number = int(chosen[patch % count])
+        candidates = np.flatnonzero(owner == number)
+        bounds = None
+        if len(candidates) and rng.random() >= settings.background_share:
+            share = chance[candidates] / chance[candidates].sum()
+            bounds = data.observations[int(rng.choice(candidates, p=share))].bounds
+        view = data.views[number]
+        column, row = _place_patch(view, bounds, settings.patch_size, stride, rng)
+        parts.append(patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride))
+        x, y, extent = column * stride, row * stride, settings.patch_size * stride
+        targets.append(data.images[number][y : y + extent, x : x + extent])
+    pixels = torch.stack(targets).permute(0, 3, 1, 2).float() / 255
+    met = np.unique(np.concatenate([part.hits.actor.numpy() for part in parts]))
+    lidar, distance = _draw_lidar(data, settings.lidar_rays, met, rng)
+    return Batch(concatenate_rays([*parts, *lidar]), settings.patches, side, pixels, distance)
+
+
+def patch_rays(view: View, column: int, row: int, size: int, margin: int, stride: int) -> Rays:
+    """Rays of a square of feature pixels from (column, row), with a margin on every side."""
+    return region_rays(
+        view, (column - margin, row - margin, column + size + margin, row + size + margin), stride
+    )
+
+
+def region_rays(view: View, region: tuple[int, int, int, int], stride: int) -> Rays:
+    """Rays of a region x0, y0, x1, y1 of feature pixels, row by row; it may reach outside the image."""
+    origins, directions = view.rays(pixel_centres(*region) * stride)
+    x0, y0, x1, y1 = (edge * stride for edge in region)
+    actors = view.actors_in((x0, y0, x1, y1))
+    return cast_rays(origins, directions, actors.index.tolist(), actors.scene_from_box, actors.sizes)
+
+
+def _place_patch(
+    view: View,
+    bounds: tuple[float, float, float, float] | None,
+    size: int,
+    stride: int,
+    rng: np.random.Generator,
+) -> tuple[int, int]:
+    """Upper left feature pixel of a patch: over the actor where there is one, anywhere where there is none."""
+    corner = []
+    for axis, extent in enumerate((view.intrinsics.width // stride, view.intrinsics.height // stride)):
+        last = extent - size
+        if last < 0:
+            raise StageError(
+                f"reconstruct: patch_size {size} exceeds the feature map of {view.camera} "
+                f"({extent} feature pixels); choose a smaller patch_size or a larger image_scale."
+            )
+        low, high = 0, last
+        if bounds is not None:
+            start, end = bounds[axis] / stride, bounds[axis + 2] / stride
+            # A small box lies somewhere inside the patch; a large one holds the patch inside.
+            low, high = sorted((round(start), round(end - size)))
+            low, high = min(max(low, 0), last), min(max(high, 0), last)
+        corner.append(int(rng.integers(low, high + 1)))
+    return corner[0], corner[1]
+
+
+def _draw_lidar(
+    data: TrainingLog, count: int, met: np.ndarray, rng: np.random.Generator
+) -> tuple[list[Rays], Tensor]:
+    """LiDAR rays of one sweep, most on actors that the batch decodes anyway."""
+    sweeps = [sweep for sweep in data.lidar if len(sweep.distance)]
+    if not count or not sweeps:
+        return [], torch.zeros(0)
+    sweep = sweeps[int(rng.integers(len(sweeps)))]
+    on, off = np.flatnonzero(np.isin(sweep.actor, met)), np.flatnonzero(sweep.actor < 0)
+    on = rng.choice(on, min(round(count * LIDAR_SHARE_ON_ACTORS), len(on)), replace=False)
+    off = rng.choice(off, min(count - len(on), len(off)), replace=False)
+    chosen = np.concatenate((on, off))
+    distance = sweep.distance[chosen]
+    placed = sweep.actors.select(np.isin(sweep.actors.index, met))
+    cast = cast_rays(
+        np.broadcast_to(sweep.origin, (len(chosen), 3)),
+        sweep.direction[chosen],
+        placed.index.tolist(),
+        placed.scene_from_box,
+        placed.sizes,
+        distance + LIDAR_BEHIND,
+    )
+    return [cast], torch.as_tensor(distance, dtype=torch.float32)

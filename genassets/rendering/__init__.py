@@ -1,0 +1,1 @@
+"""Ragged, culled sampling along rays, compositing in depth order, and the camera's image network."""

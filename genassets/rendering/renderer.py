@@ -1,0 +1,299 @@
+"""Occlusion-aware rendering of actors and background along rays (paper sections 3.1 and 3.2).
+
+Work is spent where it can show: boxes and occupancy cull samples before any look-up, a first pass without
+gradients finds the weights, and only samples that carry weight are evaluated with features and gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from genassets.fields.background import contract
+from genassets.fields.feature_field import FeatureField
+from genassets.fields.opacity import log_transmittance
+from genassets.fields.shape_prior import rounded_box_distance
+from genassets.fields.triplane import interpolate_triplanes
+from genassets.rendering.compositing import OPAQUE, accumulate, depth_order, log_light, render_weights
+from genassets.rendering.rays import BOX_PADDING, Rays
+from genassets.rendering.sampling import (
+    ActorSamples,
+    BackgroundSamples,
+    OccupancyGrid,
+    sample_actors,
+    sample_background,
+    sample_sky,
+    step_edges,
+)
+
+ACTOR_REFERENCE_STEP = 0.05
+BACKGROUND_REFERENCE_STEP = 0.30
+BACKGROUND_START = 0.1
+"""Signed distance in metres that an untrained background has everywhere: thin fog, not a wall."""
+
+
+CLEAR_BEYOND = 4.0
+"""A sample is in the clear where beta x sdf exceeds this: its opacity is then below 2 %."""
+
+LOG_HIDDEN = -6.0
+"""A sample is hidden where less than exp of this of the light gets through to it."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """Step lengths and culls of one rendering. All lengths in metres.
+
+    exact: no occupancy and no weight threshold; every sample of every crossed box is evaluated.
+    """
+
+    actor_step: float
+    actor_growth: float
+    background_step: float
+    background_growth: float
+    background_near: float
+    background_far: float
+    sky_samples: int
+    weight_threshold: float
+    exact: bool = False
+
+
+@dataclass(frozen=True)
+class CoarseActors:
+    """What is known of every actor without decoding it; sizes are l, w, h in metres.
+
+    distance holds the signed distance in metres at the cell centres of each actor's padded box, as it last
+    was: what culls samples, and whole actors, before any look-up.
+    """
+
+    size: Float[Tensor, "actors 3"]
+    distance: Float[Tensor, "actors grid grid grid"]
+    beta: Float[Tensor, ""]
+
+
+@dataclass(frozen=True)
+class ActorFields:
+    """Decoded actors. slot maps an actor's index in the library to the place of its planes."""
+
+    field: FeatureField
+    beta: Float[Tensor, ""]
+    planes: Float[Tensor, "slots 3 channels height width"]
+    slot: Int[Tensor, " actors"]
+    size: Float[Tensor, "actors 3"]
+
+
+@dataclass(frozen=True)
+class BackgroundFields:
+    """The static scene of one log. scale (3,) in metres maps scene coordinates to the unit ball."""
+
+    field: FeatureField
+    beta: Float[Tensor, ""]
+    planes: Float[Tensor, "1 3 channels height width"]
+    scale: Float[Tensor, 3]
+    occupancy: OccupancyGrid
+
+
+@dataclass(frozen=True)
+class Culled:
+    """The samples inside boxes that can carry weight, and how many there were before."""
+
+    samples: ActorSamples
+    in_boxes: int
+
+    def actors(self, rays: Rays) -> Int[Tensor, " met"]:
+        """The actors to decode: those with a sample left. One stands in where there is none."""
+        met = torch.unique(rays.hits.actor[self.samples.hit])
+        return met if len(met) else met.new_zeros(1)
+
+
+@dataclass(frozen=True)
+class SampleCounts:
+    """How many samples were left after each cull."""
+
+    in_boxes: int
+    in_occupied_boxes: int
+    background: int
+    shaded: int
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What rays see: feature, expected distance in metres (sky left out), opacity (sky left out)."""
+
+    feature: Float[Tensor, "rays channels"]
+    distance: Float[Tensor, " rays"]
+    opacity: Float[Tensor, " rays"]
+    counts: SampleCounts
+
+
+@dataclass(frozen=True)
+class _Evaluated:
+    """Samples of both fields in one list: actors first, then background."""
+
+    log_transmittance: Tensor
+    ray: Tensor
+    distance: Tensor
+    actor_intermediate: Tensor
+    background_intermediate: Tensor
+
+
+def cull(
+    rays: Rays, coarse: CoarseActors, settings: RenderSettings, generator: torch.Generator | None = None
+) -> Culled:
+    """Sample the boxes that rays cross and drop what cannot be seen, before anything is decoded.
+
+    With a generator the samples are jittered (training).
+    """
+    boxed = sample_actors(rays, settings.actor_step, settings.actor_growth, generator)
+    kept = boxed if settings.exact else boxed.select(_may_be_seen(boxed, rays, coarse))
+    return Culled(kept, len(boxed.hit))
+
+
+def render_rays(
+    rays: Rays,
+    culled: Culled,
+    actors: ActorFields,
+    background: BackgroundFields | None,
+    settings: RenderSettings,
+    generator: torch.Generator | None = None,
+) -> Rendered:
+    """Render features and distances along rays through all actors that they meet and the background.
+
+    Without a background, rays see actors alone.
+    """
+    occupied = culled.samples
+    static = _background_samples(rays, background, settings, generator)
+    background_count = len(static.ray)
+
+    with torch.no_grad():
+        evaluated = _evaluate(occupied, static, rays, actors, background)
+        order = depth_order(evaluated.ray, evaluated.distance)
+        weight = torch.empty_like(evaluated.distance)
+        weight[order] = render_weights(evaluated.log_transmittance[order], evaluated.ray[order])
+    threshold = 0.0 if settings.exact else settings.weight_threshold
+    keep = weight >= threshold
+    keep_actor, keep_static = keep[: len(occupied.hit)], keep[len(occupied.hit) :]
+    seen, static = occupied.select(keep_actor), static.select(keep_static)
+    if torch.is_grad_enabled():
+        evaluated = _evaluate(seen, static, rays, actors, background)
+    else:
+        evaluated = _Evaluated(
+            evaluated.log_transmittance[keep],
+            evaluated.ray[keep],
+            evaluated.distance[keep],
+            evaluated.actor_intermediate[keep_actor],
+            evaluated.background_intermediate[keep_static],
+        )
+
+    feature = actors.field.feature(evaluated.actor_intermediate, rays.hits.direction[seen.hit])
+    if background is not None:
+        behind = background.field.feature(evaluated.background_intermediate, rays.direction[static.ray])
+        feature = torch.cat((feature, behind))
+    order = depth_order(evaluated.ray, evaluated.distance)
+    ray = evaluated.ray[order]
+    weight = render_weights(evaluated.log_transmittance[order], ray)
+    distance = evaluated.distance[order]
+    solid = (distance < settings.background_far).to(weight.dtype)
+    geometry = torch.stack((distance * solid, solid), dim=-1)
+    sums = accumulate(weight, geometry, ray, len(rays))
+    return Rendered(
+        accumulate(weight, feature[order], ray, len(rays)),
+        sums[:, 0],
+        sums[:, 1],
+        SampleCounts(culled.in_boxes, len(occupied.hit), background_count, len(ray)),
+    )
+
+
+def actor_distance(
+    position: Float[Tensor, "samples 3"], actor: Int[Tensor, " samples"], actors: ActorFields
+) -> tuple[Float[Tensor, " samples"], Float[Tensor, "samples hidden"]]:
+    """Signed distance in metres at box-frame positions, and the intermediate feature."""
+    coordinates = position / padded_half_size(actors.size)[actor]
+    features = interpolate_triplanes(actors.planes, actors.slot[actor], coordinates)
+    residual, intermediate = actors.field.distance(features)
+    return rounded_box_distance(position, actors.size[actor]) + residual, intermediate
+
+
+def padded_half_size(size: Float[Tensor, "actors 3"]) -> Float[Tensor, "actors 3"]:
+    """Half the size of the padded boxes, in metres."""
+    return size / 2 + torch.tensor(BOX_PADDING, dtype=size.dtype, device=size.device)
+
+
+def _evaluate(
+    boxed: ActorSamples,
+    static: BackgroundSamples,
+    rays: Rays,
+    actors: ActorFields,
+    background: BackgroundFields | None,
+) -> _Evaluated:
+    sdf, intermediate = actor_distance(boxed.position, rays.hits.actor[boxed.hit], actors)
+    absorbed = log_transmittance(sdf, actors.beta, boxed.step, ACTOR_REFERENCE_STEP)
+    ray, distance = rays.hits.ray[boxed.hit], boxed.distance
+    if background is None:
+        return _Evaluated(absorbed, ray, distance, intermediate, intermediate[:0])
+    coordinates = contract(static.position / background.scale)
+    slot = torch.zeros_like(static.ray)
+    residual, static_intermediate = background.field.distance(
+        interpolate_triplanes(background.planes, slot, coordinates)
+    )
+    opaque = torch.isinf(static.step)
+    step = static.step.masked_fill(opaque, 0.0)
+    behind = log_transmittance(
+        BACKGROUND_START + residual, background.beta, step, BACKGROUND_REFERENCE_STEP
+    ).masked_fill(opaque, OPAQUE)
+    return _Evaluated(
+        torch.cat((absorbed, behind)),
+        torch.cat((ray, static.ray)),
+        torch.cat((distance, static.distance)),
+        intermediate,
+        static_intermediate,
+    )
+
+
+def _background_samples(
+    rays: Rays,
+    background: BackgroundFields | None,
+    settings: RenderSettings,
+    generator: torch.Generator | None,
+) -> BackgroundSamples:
+    if background is None:
+        none = torch.zeros(0, device=rays.origin.device)
+        return BackgroundSamples(none.long(), none.reshape(0, 3), none, none)
+    edges = step_edges(
+        settings.background_near,
+        settings.background_far,
+        settings.background_step,
+        settings.background_growth,
+    )
+    near = sample_background(rays, edges, background.occupancy, generator)
+    sky = sample_sky(rays, settings.sky_samples, settings.background_far)
+    return BackgroundSamples(
+        torch.cat((near.ray, sky.ray)),
+        torch.cat((near.position, sky.position)),
+        torch.cat((near.distance, sky.distance)),
+        torch.cat((near.step, sky.step)),
+    )
+
+
+def _may_be_seen(samples: ActorSamples, rays: Rays, coarse: CoarseActors) -> Bool[Tensor, " samples"]:
+    """Which samples can carry weight, by the coarse distance: not in the clear, not behind a surface.
+
+    The distance at a sample differs from that of its cell's centre by at most the cell's radius, which is
+    given to either side in doubt. Surfaces of nearer actors hide too.
+    """
+    actor = rays.hits.actor[samples.hit]
+    half = padded_half_size(coarse.size)
+    resolution = coarse.distance.shape[-1]
+    cell = ((samples.position / half[actor] * 0.5 + 0.5) * resolution).long().clamp(0, resolution - 1)
+    flat = ((actor * resolution + cell[:, 0]) * resolution + cell[:, 1]) * resolution + cell[:, 2]
+    distance = coarse.distance.reshape(-1)[flat]
+    radius = torch.linalg.vector_norm(half / resolution, dim=-1)[actor]
+    absorbed = log_transmittance(distance + radius, coarse.beta, samples.step, ACTOR_REFERENCE_STEP)
+    ray = rays.hits.ray[samples.hit]
+    order = depth_order(ray, samples.distance)
+    before = torch.empty_like(absorbed)
+    before[order] = log_light(absorbed[order], ray[order]).to(absorbed.dtype)
+    in_the_clear = coarse.beta * (distance - radius) > CLEAR_BEYOND
+    return ~in_the_clear & (before > LOG_HIDDEN)

@@ -1,0 +1,48 @@
+"""The convolutional network that turns a rendered feature map into an image (paper, "Camera RGB CNN")."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class RgbNetwork(nn.Module):
+    """Residual blocks without normalisation, with 2x upsampling after the second and the fourth.
+
+    No normalisation, because patches in training have other statistics than whole frames. upsamplings is 0,
+    1 or 2: the factor between feature map and image is 2^upsamplings. The paper: 6 blocks, 32 channels,
+    kernel 5, two upsamplings.
+    """
+
+    def __init__(self, features: int, channels: int, kernel: int, blocks: int, upsamplings: int) -> None:
+        super().__init__()
+        if blocks < 2 * upsamplings:
+            raise ValueError(
+                f"{blocks} blocks leave no place for {upsamplings} upsamplings after every second"
+            )
+        self.upsample_after = {2 * (i + 1) - 1 for i in range(upsamplings)}
+        self.head = nn.Conv2d(features, channels, 1)
+        self.blocks = nn.ModuleList(_Block(channels, kernel) for _ in range(blocks))
+        self.image = nn.Conv2d(channels, 3, kernel, padding=kernel // 2, padding_mode="replicate")
+
+    def forward(self, feature_map: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 height width"]:
+        """Images in [0, 1]."""
+        x = self.head(feature_map.contiguous(memory_format=torch.channels_last))
+        for index, block in enumerate(self.blocks):
+            x = block(x)
+            if index in self.upsample_after:
+                x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        return torch.sigmoid(self.image(x))
+
+
+class _Block(nn.Module):
+    def __init__(self, channels: int, kernel: int) -> None:
+        super().__init__()
+        pad = kernel // 2
+        self.conv1 = nn.Conv2d(channels, channels, kernel, padding=pad, padding_mode="replicate")
+        self.conv2 = nn.Conv2d(channels, channels, kernel, padding=pad, padding_mode="replicate")
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.conv2(F.relu(self.conv1(x)))
