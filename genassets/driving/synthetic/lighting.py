@@ -174,7 +174,7 @@ def shade(
     highlight = np.zeros_like(albedo)
     reflected = ray + 2 * facing * normal
     if light.night:
-        _add_lamps(city, light, points, normal, incoming, openness)
+        _add_lamps(city, light, points, normal, incoming)
         if beam is not None:
             _add_beam(beam, points, normal, kind, albedo, incoming, highlight)
     else:
@@ -184,18 +184,23 @@ def shade(
         free = ~city.occluded(start, np.broadcast_to(light.sun_direction, start.shape))
         lit = lit[free]
         incoming[lit] += cosine[lit, None] * light.sun
-        gloss = np.clip(reflected[lit] @ light.sun_direction, 0.0, 1.0) ** SHININESS[kind[lit]]
-        highlight[lit] += (gloss * np.minimum(MIRROR[kind[lit]] * 12.0, 1.5))[:, None] * light.sun
-    mirror = MIRROR[kind]
-    fresnel = mirror + np.where(
-        mirror > 0, (1 - mirror) * (1 - np.clip(np.abs(facing[:, 0]), 0, 1)) ** 5, 0.0
-    )
-    mirrored = sky(light, reflected, disc=False)
+        shiny = lit[MIRROR[kind[lit]] > 0]
+        gloss = np.clip(reflected[shiny] @ light.sun_direction, 0.0, 1.0) ** SHININESS[kind[shiny]]
+        highlight[shiny] += (gloss * np.minimum(MIRROR[kind[shiny]] * 12.0, 1.5))[:, None] * light.sun
+    colour = albedo * incoming
+    glossy = np.flatnonzero(MIRROR[kind] > 0)
+    mirror = MIRROR[kind[glossy]]
+    fresnel = (mirror + (1 - mirror) * (1 - np.clip(facing[glossy, 0], 0, 1)) ** 5)[:, None]
     # Low reflections show the houses across the street, not the sky.
-    houses = np.clip(1.0 - reflected[:, 2:3] * 2.2, 0.0, 1.0)
-    mirrored = mirrored * (1 - 0.62 * houses)
-    colour = albedo * incoming * (1 - fresnel[:, None]) + fresnel[:, None] * mirrored + highlight
-    colour += glow[:, None] * (albedo + 0.15 * albedo.max(1, keepdims=True))
+    houses = np.clip(1.0 - reflected[glossy, 2:3] * 2.2, 0.0, 1.0)
+    mirrored = sky(light, reflected[glossy], disc=False) * (1 - 0.62 * houses)
+    colour[glossy] += fresnel * (mirrored - colour[glossy])
+    colour += highlight
+    own = np.flatnonzero(glow)
+    # A lit window shows the room's warm light, not the colour of its glass.
+    room = (kind[own] == Kind.LIT_WINDOW)[:, None]
+    tint = np.where(room, ROOM_COLOUR, albedo[own] + 0.15 * albedo[own].max(1, keepdims=True))
+    colour[own] += glow[own, None] * tint
     # Aerial perspective.
     haze = 1.0 - np.exp(-seen.distance / (900.0 if not light.night else 1500.0))
     radiance[rows] = colour + (light.horizon - colour) * haze[:, None]
@@ -229,9 +234,7 @@ def _contact_shade(points: F32, flat: NDArray[np.bool_], footprints: Footprints)
     return open_part
 
 
-def _add_lamps(
-    city: TracedCity, light: Light, points: F32, normal: F32, incoming: F32, openness: F32
-) -> None:
+def _add_lamps(city: TracedCity, light: Light, points: F32, normal: F32, incoming: F32) -> None:
     """Add the street lamps' light to `incoming` (N, 3); the strongest one's shadow is cast."""
     strongest = np.zeros(len(points), dtype=np.float32)
     which = np.full(len(points), -1, dtype=np.int64)
@@ -251,8 +254,8 @@ def _add_lamps(
             (np.clip((normal[near] * towards).sum(1), 0.0, 1.0) + 0.08)
             * spread
             * edge
-            * 17.0
-            / (square + 4.0)
+            * 30.0
+            / (square + 6.0)
         )
         power = power.astype(np.float32)
         incoming[near] += power[:, None] * LAMP_COLOUR

@@ -25,7 +25,7 @@ from genassets.driving.synthetic.trajectories import Path
 Float = NDArray[np.float64]
 MAX_RANGE = 200.0
 MIN_RANGE = 1.0
-SPINNING_GAIN, FORWARD_GAIN = 0.6, 1.6
+SPINNING_GAIN, FORWARD_GAIN = 1.6, 5.0
 """Scale of the intensities: on PandaSet the forward LiDAR's median is about three times the spinning one's."""
 
 
