@@ -26,7 +26,6 @@ PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)  # ImageNet's, RGB 
 PIXEL_STD = np.array([58.395, 57.12, 57.375], dtype=np.float32)
 BOX_CORNERS = [2.0, 3.0]  # the labels that SAM gives points
 ON_OBJECT = 1.0
-ELSEWHERE = 0.0
 DECODER_INPUTS = (
     "image_embeddings",
     "point_coords",
@@ -44,6 +43,8 @@ class SamSegmenter:
     encoder_path, decoder_path: the ONNX pair. label: what the object table calls it ("sam" and a digest).
     bounds_padding: pixels outside the box's bounds, widened by this fraction of its sides, never belong to
     it.
+    lidar_points: how many of the actor's returns are given besides the box, as points on the object. The
+    paper prompts with the box alone, which also keeps the LiDAR test independent of the mask.
     threads: of onnxruntime; None is every core. The masks do not depend on it beyond rounding.
 
     Raises:
@@ -57,15 +58,13 @@ class SamSegmenter:
         label: str = "sam",
         crops: CropSettings | None = None,
         bounds_padding: float = 0.05,
-        actor_points: int = 0,
-        other_points: int = 0,
+        lidar_points: int = 0,
         threads: int | None = None,
     ) -> None:
         self.name = label
         self._crops = crops or CropSettings()
         self._bounds_padding = bounds_padding
-        self._actor_points = actor_points
-        self._other_points = other_points
+        self._lidar_points = lidar_points
         threads = threads or os.cpu_count() or 1
         self._encoder = _open_model(encoder_path, threads)
         self._decoder = _open_model(decoder_path, threads)
@@ -115,10 +114,9 @@ class SamSegmenter:
         scale = placement.scale
         offset = np.array([placement.x, placement.y], dtype=np.float64)
         corners = np.array(prompt.bounds, dtype=np.float64).reshape(2, 2)
-        on_actor = spread_points(prompt.on_actor, self._actor_points)
-        others = spread_points(prompt.in_front, self._other_points)
-        points = (np.concatenate([corners, on_actor, others]) - [x0, y0]) * scale + offset
-        labels = BOX_CORNERS + [ON_OBJECT] * len(on_actor) + [ELSEWHERE] * len(others)
+        on_actor = spread_points(prompt.on_actor, self._lidar_points)
+        points = (np.concatenate([corners, on_actor]) - [x0, y0]) * scale + offset
+        labels = BOX_CORNERS + [ON_OBJECT] * len(on_actor)
         low: NDArray[np.float32] = self._decoder.run(
             [LOW_RESOLUTION],
             {
@@ -165,6 +163,8 @@ def _open_model(path: Path, threads: int) -> Any:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
+    # Threads that spin while they wait starve the other shards of a run.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # onnxruntime's exception classes have no public base

@@ -25,6 +25,7 @@ def choose_segmenter(
     decoder: Path | None = None,
     crops: CropSettings | None = None,
     grabcut: GrabCutSettings | None = None,
+    lidar_points: int = 0,
     threads: int | None = None,
 ) -> Segmenter:
     """The segmenter to use.
@@ -44,7 +45,9 @@ def choose_segmenter(
     if kind == "grabcut":
         return GrabCutSegmenter(grabcut)
     if encoder is not None and decoder is not None:
-        return SamSegmenter(encoder, decoder, sam_label(encoder, decoder), crops, threads=threads)
+        return SamSegmenter(
+            encoder, decoder, sam_label(encoder, decoder), crops, lidar_points=lidar_points, threads=threads
+        )
     try:
         encoder, decoder = weights.path("sam-encoder"), weights.path("sam-decoder")
     except WeightsError as error:
@@ -52,7 +55,9 @@ def choose_segmenter(
             raise
         logger.warning("masks by GrabCut instead of the SAM-style segmenter: %s", error)
         return GrabCutSegmenter(grabcut)
-    return SamSegmenter(encoder, decoder, sam_label(encoder, decoder), crops, threads=threads)
+    return SamSegmenter(
+        encoder, decoder, sam_label(encoder, decoder), crops, lidar_points=lidar_points, threads=threads
+    )
 
 
 def sam_label(encoder: Path, decoder: Path) -> str:

@@ -63,6 +63,12 @@ class PrepareMasksConfig(BaseModel):
     )
     margin_px: float = Field(20.0, ge=0, description="Context around a box in its crop, pixels at least.")
     margin_fraction: float = Field(0.15, ge=0, description="Context in parts of the box's longer side.")
+    lidar_points: int = Field(
+        0, ge=0, description="Returns given to the SAM-style segmenter besides the box; the paper gives none."
+    )
+    exclusive: bool = Field(
+        True, description="A pixel that several masks claim belongs to the nearest actor."
+    )
     anchor_tracks: bool = Field(
         True, description="Date moving actors' boxes by the LiDAR points inside them before projecting."
     )
@@ -108,6 +114,7 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
         config.encoder,
         config.decoder,
         CropSettings(config.grouping, config.margin_px, config.margin_fraction),
+        lidar_points=config.lidar_points,
         threads=config.threads,
     )
     rows: list[dict[str, Any]] = []
@@ -129,7 +136,7 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
                 if row["reason"] is None:
                     wanted.append((row, observation))
             if wanted:
-                _fill_masks(wanted, segmenter, sweep, truth, context.work_dir)
+                _fill_masks(wanted, segmenter, sweep, truth, context.work_dir, config.exclusive)
             rows += found
         context.progress(frame + 1, log.frame_count, f"masks of frame {frame} ({len(rows)} observations)")
     write_object_table(out / "objects.parquet", rows)
@@ -177,16 +184,20 @@ def _fill_masks(
     sweep: Sweep | None,
     truth: Truth | None,
     work_dir: Path,
+    exclusive: bool,
 ) -> None:
     """Segment the wanted actors of one image and complete their rows."""
     import numpy as np
 
     from genassets.masks.agreement import mask_iou
     from genassets.masks.lidar_consistency import fraction_outside
+    from genassets.masks.overlaps import give_to_nearest
     from genassets.masks.run_length import encode_mask
 
     camera, frame = wanted[0][1].camera, wanted[0][1].frame
     masks = _masks_of_image([observation for _, observation in wanted], segmenter, sweep, work_dir)
+    if exclusive:
+        masks = give_to_nearest(masks, [row["depth"] for row, _ in wanted])
     instances = truth.instances(camera.name, frame) if truth is not None else None
     for (row, observation), mask in zip(wanted, masks, strict=True):
         outside = fraction_outside(mask, observation.lidar_pixels)
