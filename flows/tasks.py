@@ -36,8 +36,7 @@ def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]
         outcomes.append(work())
         return outcomes[-1].stored.fingerprint
 
-    run = task(
-        step,
+    as_task = task(
         name=key.partition("[")[0],
         task_run_name=key,
         cache_policy=NO_CACHE,
@@ -46,5 +45,5 @@ def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]
         retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=worth_retrying,
     )
-    run(inputs=dict(inputs))
+    as_task(step)(inputs=dict(inputs))
     return outcomes[-1]

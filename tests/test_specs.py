@@ -76,16 +76,12 @@ def test_two_logs_of_one_name() -> None:
         ("", r"f: expected a mapping"),
         ("1: a", r"f:1: keys have to be words"),
         ("a: !!python/object:os.system x", r"f:1: not valid YAML"),
-        ("a: &x [*x]", r"f"),
+        ("a: &x [*x]", r"f:1: .* refers to itself"),
     ],
 )
 def test_malformed_yaml(text: str, message: str) -> None:
-    try:
+    with pytest.raises(SpecError, match="^" + message):
         parse_document(text, "f")
-    except SpecError as error:
-        assert __import__("re").match(message, str(error))
-    else:
-        assert "&x" in text  # a list that holds itself is YAML; validation refuses it later
 
 
 def test_missing_file_lists_what_is_there(tmp_path: Path) -> None:

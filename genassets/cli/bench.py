@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -26,7 +27,7 @@ def bench(
         raise SpecError(f"benchmark {unknown[0]!r}: unknown; there are {', '.join(known)}")
     results = read_results(out)
     for name in names or known:
-        rows = known[name].run(lambda text, name=name: typer.echo(f"{name}: {text}", err=True))
+        rows = known[name].run(partial(_say, name))
         results[name] = {
             "summary": known[name].summary,
             "date": time.strftime("%Y-%m-%d"),
@@ -36,3 +37,7 @@ def bench(
         }
         table = write_results(out, results)
         typer.echo(f"{name}: {len(rows)} rows -> {table}", err=True)
+
+
+def _say(name: str, text: str) -> None:
+    typer.echo(f"{name}: {text}", err=True)

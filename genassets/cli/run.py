@@ -55,7 +55,7 @@ def run_request(request: RunRequest, as_json: bool) -> None:
         from genassets.pipeline.executor import json_document
 
         typer.echo(json.dumps(json_document(record), allow_nan=False))
-    raise typer.Exit(record.exit_code)
+    raise typer.Exit(record.exit_code or 0)
 
 
 def _run_inline(request: RunRequest) -> RunRecord:

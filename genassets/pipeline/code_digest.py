@@ -95,7 +95,9 @@ class _digest_and_imports:
         try:
             return code_digest_of(text), sorted(self._imports(ast.parse(text)))
         except SyntaxError as error:
-            raise StageError(f"{path}:{error.lineno}: not valid Python: {error.msg}; correct it first") from error
+            raise StageError(
+                f"{path}:{error.lineno}: not valid Python: {error.msg}; correct it first"
+            ) from error
 
     def _imports(self, tree: ast.Module) -> set[str]:
         found: set[str] = set()

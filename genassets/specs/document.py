@@ -18,6 +18,8 @@ from genassets.errors import SpecError
 
 KeyPath = tuple[str | int, ...]
 
+LARGEST_DOCUMENT = 100_000
+
 
 @dataclass(frozen=True)
 class Document:
@@ -97,7 +99,7 @@ def parse_document(text: str, name: str) -> Document:
             if not isinstance(node, yaml.MappingNode):
                 raise SpecError(f"{name}: expected a mapping of keys to values at the top level")
             origins: dict[KeyPath, str] = {(): name}
-            _record_origins(node, (), name, origins)
+            _record_origins(node, (), name, origins, ())
             values = loader.construct_document(node)
         finally:
             loader.dispose()
@@ -109,7 +111,15 @@ def parse_document(text: str, name: str) -> Document:
     return Document(values, origins)
 
 
-def _record_origins(node: yaml.Node, at: KeyPath, name: str, origins: dict[KeyPath, str]) -> None:
+def _record_origins(
+    node: yaml.Node, at: KeyPath, name: str, origins: dict[KeyPath, str], above: tuple[yaml.Node, ...]
+) -> None:
+    if any(node is parent for parent in above):
+        raise SpecError(f"{name}:{node.start_mark.line + 1}: {'.'.join(map(str, at))} refers to itself")
+    if len(origins) > LARGEST_DOCUMENT:
+        raise SpecError(
+            f"{name}: more than {LARGEST_DOCUMENT} values; anchors that multiply are not expanded"
+        )
     children: Iterable[tuple[str | int, yaml.Node, yaml.Node]]
     if isinstance(node, yaml.MappingNode):
         children = []
@@ -134,7 +144,7 @@ def _record_origins(node: yaml.Node, at: KeyPath, name: str, origins: dict[KeyPa
     for key, mark_node, value_node in children:
         path = (*at, key)
         origins[path] = f"{name}:{mark_node.start_mark.line + 1}"
-        _record_origins(value_node, path, name, origins)
+        _record_origins(value_node, path, name, origins, (*above, node))
 
 
 def override_document(override: str) -> Document:

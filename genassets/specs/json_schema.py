@@ -16,7 +16,8 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 def experiment_schema(configs: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
     """Schema of data_specs/experiments/*.yaml."""
-    schema = _hoisted(ExperimentHeader, definitions := {})
+    definitions: dict[str, Any] = {}
+    schema = _hoisted(ExperimentHeader, definitions)
     schema["properties"]["dataset"] = {"anyOf": [{"type": "string"}, {"type": "object"}]}
     for name, config in configs.items():
         section = _hoisted(config, definitions)

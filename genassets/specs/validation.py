@@ -65,8 +65,8 @@ def _walk(model: type[BaseModel], loc: tuple[str | int, ...]) -> tuple[KeyPath, 
     path: list[str | int] = []
     candidates: list[type[BaseModel]] = [model]
     for index, part in enumerate(loc):
-        holder = next((m for m in candidates if isinstance(part, str) and part in m.model_fields), None)
-        if holder is not None:
+        holder = next((m for m in candidates if part in m.model_fields), None)
+        if holder is not None and isinstance(part, str):
             owner = holder
             path.append(part)
             candidates = _models_in(holder.model_fields[part].annotation)

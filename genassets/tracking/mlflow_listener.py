@@ -56,7 +56,9 @@ class MlflowListener:
             tags=tags,
             params=dict(flat_params(header)),
         )
-        self._thread = threading.Thread(target=self._send_all, args=(record.run_id,), daemon=True, name="mlflow")
+        self._thread = threading.Thread(
+            target=self._send_all, args=(record.run_id,), daemon=True, name="mlflow"
+        )
         self._thread.start()
 
     def step_started(self, step: StepRecord) -> None:
