@@ -171,15 +171,18 @@ def _plots(step: StepRecord, folder: Path) -> list[Picture]:
     path = Path(step.path or "") / CURVES
     if not path.is_file():
         return []
-    import pandas as pd
+    import numpy as np
+    import pyarrow.parquet as pq
 
     from genassets.reporting.curve_plot import write_curve_plot
 
-    table = pd.read_parquet(path)
-    curves = [
-        (str(name), group["step"].to_numpy(), group["value"].to_numpy())
-        for name, group in table.sort_values(["name", "step"]).groupby("name", sort=True)
-    ]
+    points: dict[str, list[tuple[int, float]]] = {}
+    for row in pq.read_table(path).to_pylist():
+        points.setdefault(row["name"], []).append((row["step"], row["value"]))
+    curves = []
+    for name, pairs in sorted(points.items()):
+        steps, values = zip(*sorted(pairs), strict=True)
+        curves.append((name, np.array(steps, dtype=np.int64), np.array(values, dtype=np.float64)))
     file = f"curves/{_file_name(step)}.svg"
     write_curve_plot(curves, folder / file)
     return [Picture(file, f"Curves of {step.key}", "Each value pale, its running mean dark.")]
