@@ -53,7 +53,7 @@ KIND_TABLE: dict[Kind, Optics] = {
     Kind.PLATE: Optics(0.0, 1.0, "", 0.0, 180.0),
     Kind.STREET_LAMP: Optics(0.0, 1.0, "night", 4.0),
     Kind.WINDOW: Optics(0.10, 400.0),
-    Kind.LIT_WINDOW: Optics(0.10, 400.0, "night", 0.7),
+    Kind.LIT_WINDOW: Optics(0.10, 400.0, "night", 0.4),
     Kind.FOLIAGE: Optics(0.0, 1.0),
 }
 
