@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from genassets.driving.log import CameraStream, Log
-from genassets.evaluation.pictures import PictureRow, picture_sheet
+from genassets.evaluation.pictures import PictureRow, picture_sheet, side_by_side
 from genassets.evaluation.sparse_view import Comparison, Observation, Scored, Skipped, evaluate_log
 from genassets.evaluation.sparse_view_pictures import HEADINGS, picture_row, representative_observations
 from genassets.evaluation.sparse_view_tables import actor_table, means, observation_table, view_table
@@ -161,7 +161,7 @@ def test_means_keep_groups_apart_and_state_gains(table: pd.DataFrame) -> None:
     assert rows["sparse_view/moved", "Car", "psnr", "model"].n == 1
     assert rows["sparse_view/unseen", "Bus", "psnr", "model"].value == pytest.approx(20.0, abs=1e-4)
     assert ("sparse_view/unseen", "Bus", "psnr", "mean_colour") not in rows
-    gain = rows["sparse_view/moved", "all", "psnr_gain", "model less mean_colour"]
+    gain = rows["sparse_view/moved", "all", "psnr_gain", "model over mean_colour"]
     assert gain.value == pytest.approx(0.0, abs=1e-3)
     assert "mask=truth" in gain.method
     # An exact nearest crop is capped, so the mean stays finite.
@@ -172,7 +172,7 @@ def test_gain_over_a_worse_baseline_is_positive(log: Log) -> None:
     scored, _ = score(log, TRAINING[:1], HELD_OUT[:2], frozenset({"a"}), error=0.02)
     rows = means(observation_table(scored).to_pandas())
     gains = {(m.setting, m.metric, m.method.split(";")[0]): m.value for m in rows}
-    gain = gains["sparse_view/moved", "psnr_gain", "model less nearest_crop"]
+    gain = gains["sparse_view/moved", "psnr_gain", "model over nearest_crop"]
     assert gain == pytest.approx(
         20 * np.log10(0.2 / 0.02), abs=1e-2
     )  # the only crop is 0.2 off, the model 0.02
@@ -215,3 +215,22 @@ def test_pictures_show_one_view_an_actor_best_first(log: Log) -> None:
     assert sheet.dtype == np.uint8 and sheet.shape[2] == 3
     with pytest.raises(ValueError, match="panels"):
         picture_sheet(HEADINGS, [PictureRow("short", [np.zeros((4, 4, 3))])])
+
+
+def test_a_smaller_lpips_is_a_gain(table: pd.DataFrame) -> None:
+    lpips = {"model": 0.1, "mean_colour": 0.4, "nearest_crop": 0.05}
+    rows = means(table.assign(lpips=table["predictor"].map(lpips)))
+    gains = {
+        m.method.split(";")[0]: m.value
+        for m in rows
+        if m.metric == "lpips_gain" and m.setting == "sparse_view/all"
+    }
+    assert gains["model over mean_colour"] == pytest.approx(0.3)
+    assert gains["model over nearest_crop"] == pytest.approx(-0.05)
+
+
+def test_small_images_are_enlarged_by_whole_numbers() -> None:
+    image = np.linspace(0, 1, 12).reshape(2, 2, 3)
+    pair = side_by_side([image, image], gap=2, least_width=5)
+    assert pair.shape == (6, 14, 3)
+    assert (pair[:3, :3] == pair[0, 0]).all()

@@ -32,7 +32,7 @@ ROWS = [
     row("sparse_view/moved", "psnr", 19.0, "nearest_crop; masked pixels; mask=truth"),
     row("sparse_view/moved", "lpips", 0.31, "model; lpips"),
     row("sparse_view/moved", "lpips", 0.12, "nearest_crop; lpips"),
-    row("sparse_view/moved", "psnr_gain", 2.5, "model less nearest_crop; masked pixels"),
+    row("sparse_view/moved", "psnr_gain", 2.5, "model over nearest_crop; masked pixels"),
     row("sparse_view/all", "psnr", 22.0, "model; masked pixels", **{"class": "Car"}),
     row("sparse_view/moved", "observations", 12, "count"),
 ]

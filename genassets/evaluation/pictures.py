@@ -57,8 +57,13 @@ def picture_sheet(
     return sheet
 
 
-def side_by_side(images: Sequence[NDArray], gap: int = 8) -> NDArray[np.uint8]:
-    """Images (h, w, 3) of one height, float in [0, 1], next to each other on white, uint8."""
+def side_by_side(images: Sequence[NDArray], gap: int = 8, least_width: int = 0) -> NDArray[np.uint8]:
+    """Images (h, w, 3) of one size, float in [0, 1], next to each other on white, uint8.
+
+    Images narrower than `least_width` are enlarged by a whole number, their pixels shown as squares.
+    """
+    times = max(1, -(-least_width // images[0].shape[1]))
+    images = [np.repeat(np.repeat(image, times, axis=0), times, axis=1) for image in images]
     height = images[0].shape[0]
     parts: list[NDArray] = []
     for image in images:

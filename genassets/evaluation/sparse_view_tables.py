@@ -137,8 +137,9 @@ def means(observations: pd.DataFrame) -> list[Mean]:
 
     Settings are `sparse_view/moved`, `/same`, `/all` (both together) and `/unseen` (actors without any
     training observation: the model alone). The split is `test`, or `test/<log>` for one log where there are
-    several. Gains are means over observations of the model's value less the baseline's, in the measure's own
-    unit.
+    several. Gains are
+    means over observations of the model's value less the baseline's, of LPIPS the other way round, so that a
+    positive gain is always for the better.
     """
     if observations.empty:
         return []
@@ -188,6 +189,8 @@ def _means_of(
                            f"{predictor}; {method}")  # fmt: skip
         for baseline in PREDICTORS[1:] if measure in GAIN_MEASURES else ():
             gains = (model[measure] - by_predictor[baseline][measure]).dropna()
+            if measure == "lpips":
+                gains = -gains  # the smaller distance is the better
             if len(gains):
                 yield Mean(setting, split, class_name, f"{measure}_gain", float(gains.mean()), len(gains),
-                           f"model less {baseline}; {method}")  # fmt: skip
+                           f"model over {baseline}; {method}")  # fmt: skip

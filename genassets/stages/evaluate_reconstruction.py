@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from genassets.export.picture_list import PictureList
 
 
+WHOLE_FRAME_WIDTH = 480
+"""Pixels that a whole frame has at least in its picture."""
+
+
 class EvaluateReconstructionConfig(BaseModel):
     """Settings of the sparse-view evaluation."""
 
@@ -218,7 +222,7 @@ def _picture_whole_frames(
         rendered = renderer.render_image(log, camera, frame)
         pictures.add(
             f"frame_{log.name}_{camera}_{frame:03d}",
-            side_by_side([truth, rendered]),
+            side_by_side([truth, rendered], least_width=WHOLE_FRAME_WIDTH),
             f"Log {log.name}, {camera}, held-out frame {frame}",
             "Stored image at the compared size (left) and the composited render (right).",
         )
