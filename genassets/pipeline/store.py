@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
-
 from genassets.errors import EnvironmentProblem, LockedError
 from genassets.pipeline.atomic_write import sync_directory
 from genassets.pipeline.file_digests import sha256_of
@@ -122,6 +120,8 @@ class Store:
         Raises:
             LockedError: another process held it for longer than ``wait_seconds``.
         """
+        from filelock import FileLock, Timeout  # plan and status take no lock
+
         path = self.root / "locks" / f"{stage}-{fingerprint}.lock"
         with _disk_errors_named(self.root):
             path.parent.mkdir(parents=True, exist_ok=True)
