@@ -24,9 +24,9 @@ def row(**changed: Any) -> dict[str, Any]:
 
 def test_metric_names() -> None:
     assert named_metrics([row()]) == {"evaluate_reconstruction/sparse_view/test/Car/psnr": 20.0}
-    both = named_metrics([row(), row(method="mean colour", value=10.0)])
+    both = named_metrics([row(method="model; masked"), row(method="mean_colour; masked", value=10.0)])
     prefix = "evaluate_reconstruction/sparse_view/test/Car/psnr"
-    assert both == {f"{prefix}/masked": 20.0, f"{prefix}/mean colour": 10.0}
+    assert both == {prefix: 20.0, f"{prefix}/mean_colour": 10.0}
     assert clean_name("a[b]:c\u00b0 d/e-f.g") == "a_b__c_ d/e-f.g"
     assert named_metrics([row(value=math.nan), row(class_name="x", metric="m", value=math.inf)]) == {}
     assert list(named_metrics([row(setting="")])) == ["evaluate_reconstruction/test/Car/psnr"]

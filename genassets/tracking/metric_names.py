@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
+MODEL = "model"  # how evaluations call the reconstruction among its baselines
 NAME_LENGTH = 250  # MLflow's limit on metric and parameter names
 VALUE_LENGTH = 6000  # and on parameter values
 
@@ -21,7 +22,8 @@ def clean_name(text: str) -> str:
 def named_metrics(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     """Metric name to finite value, such as "evaluate_reconstruction/sparse_view/test/Car/psnr".
 
-    The method is appended where rows differ in nothing else. MLflow cannot store NaN on every backend, so
+    Where rows differ in nothing else, the first part of the method is appended ("psnr/mean_colour"), except
+    for the model itself: its metric keeps the plain name. MLflow cannot store NaN on every backend, so
     values that are not finite stay in the Parquet table only.
     """
     listed = list(rows)
@@ -30,7 +32,9 @@ def named_metrics(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     named: dict[str, float] = {}
     for row, name in zip(listed, plain, strict=True):
         if math.isfinite(row["value"]):
-            named[clean_name(f"{name}/{row['method']}" if counts[name] > 1 else name)] = float(row["value"])
+            predictor = row["method"].partition(";")[0].strip()
+            plain_name = counts[name] == 1 or predictor == MODEL
+            named[clean_name(name if plain_name else f"{name}/{predictor}")] = float(row["value"])
     return named
 
 
