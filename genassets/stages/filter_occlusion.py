@@ -29,29 +29,35 @@ class FilterOcclusionConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     max_lidar_outside: float = Field(
-        0.30, ge=0, le=1, description="Fraction of the actor's returns in the image that may miss the mask."
+        default=0.30,
+        ge=0,
+        le=1,
+        description="Fraction of the actor's returns in the image that may miss the mask.",
     )
     min_lidar_points: int = Field(
-        1, ge=1, description="With fewer returns in the image the LiDAR test is not made."
+        default=1, ge=1, description="With fewer returns in the image the LiDAR test is not made."
     )
-    reject_untested: bool = Field(False, description="Drop rows whose LiDAR test cannot be made.")
+    reject_untested: bool = Field(default=False, description="Drop rows whose LiDAR test cannot be made.")
     min_mask_px: float = Field(
-        100.0, ge=0, description="Mask pixels in a 1920 x 1080 image; DiscoScene's variant is 200."
+        default=100.0, ge=0, description="Mask pixels in a 1920 x 1080 image; DiscoScene's variant is 200."
     )
     scale_with_image: bool = Field(
-        True, description="Count min_mask_px in proportion to the stored image's area."
+        default=True, description="Count min_mask_px in proportion to the stored image's area."
     )
     occlusion: Literal["union", "iou"] = Field(
-        "union",
+        default="union",
         description="union: part of the box under nearer boxes; iou: DiscoScene's, with one nearer box.",
     )
     outline: Literal["hull", "bounds"] = Field(
-        "hull", description="What stands for a box under union: its convex hull or its bounding rectangle."
+        default="hull",
+        description="What stands for a box under union: its convex hull or its bounding rectangle.",
     )
-    max_occluded: float = Field(0.50, ge=0, le=1, description="Largest covered fraction, or IoU.")
-    resolution: int = Field(256, ge=16, description="Side of the benchmark's square crops, pixels.")
-    crop_margin: float = Field(0.1, ge=0, description="Context around the box, of its longer side.")
-    contact_sheet: int = Field(40, ge=0, description="Actors on each contact sheet, drawn with the seed.")
+    max_occluded: float = Field(default=0.50, ge=0, le=1, description="Largest covered fraction, or IoU.")
+    resolution: int = Field(default=256, ge=16, description="Side of the benchmark's square crops, pixels.")
+    crop_margin: float = Field(default=0.1, ge=0, description="Context around the box, of its longer side.")
+    contact_sheet: int = Field(
+        default=40, ge=0, description="Actors on each contact sheet, drawn with the seed."
+    )
 
 
 def run(inputs: Inputs, config: FilterOcclusionConfig, out: Path, context: StageContext) -> list[Metric]:

@@ -31,49 +31,63 @@ class PrepareMasksConfig(BaseModel):
 
     split: Split = Split()
     cameras: tuple[str, ...] | None = Field(
-        None, description="Cameras that get masks; none: those of the split, for training and for testing."
+        default=None,
+        description="Cameras that get masks; none: those of the split, for training and for testing.",
     )
     frames: Literal["all", "training", "test"] | tuple[int, ...] = Field(
-        "all", description="Frames that get masks: by the split, or frame indices."
+        default="all", description="Frames that get masks: by the split, or frame indices."
     )
     min_box_px: float = Field(
-        100.0, ge=0, description="Boxes of less area get no mask (pixels of a 1920 x 1080 image)."
+        default=100.0, ge=0, description="Boxes of less area get no mask (pixels of a 1920 x 1080 image)."
     )
     scale_with_image: bool = Field(
-        True, description="Count min_box_px in proportion to the stored image's area."
+        default=True, description="Count min_box_px in proportion to the stored image's area."
     )
     max_truncation: float = Field(
-        1.0, ge=0, le=1, description="Boxes with more of their extent outside the image get no mask."
+        default=1.0, ge=0, le=1, description="Boxes with more of their extent outside the image get no mask."
     )
-    max_depth: float | None = Field(None, gt=0, description="Boxes farther than this get no mask (metres).")
+    max_depth: float | None = Field(
+        default=None, gt=0, description="Boxes farther than this get no mask (metres)."
+    )
     max_occluded: float | None = Field(
-        0.5,
+        default=0.5,
         ge=0,
         le=1,
         description="Boxes with more of their area under nearer boxes get no mask, because filter_occlusion "
         "would drop them; none: mask them all.",
     )
     segmenter: Literal["auto", "sam", "grabcut"] = Field(
-        "auto", description="auto: the SAM-style files where they are verified, else GrabCut by its own name."
+        default="auto",
+        description="auto: the SAM-style files where they are verified, else GrabCut by its own name.",
     )
-    encoder: Path | None = Field(None, description="A SAM-style ONNX encoder other than the pinned one.")
-    decoder: Path | None = Field(None, description="The decoder that belongs to the encoder.")
+    encoder: Path | None = Field(
+        default=None, description="A SAM-style ONNX encoder other than the pinned one."
+    )
+    decoder: Path | None = Field(default=None, description="The decoder that belongs to the encoder.")
     grouping: Literal["single", "shared", "grid_2", "grid_3", "grid_4", "adaptive"] = Field(
-        "adaptive", description="How crops share an encoder input; single is the exact mode (docs/masks.md)."
+        default="adaptive",
+        description="How crops share an encoder input; single is the exact mode (docs/masks.md).",
     )
-    margin_px: float = Field(20.0, ge=0, description="Context around a box in its crop, pixels at least.")
-    margin_fraction: float = Field(0.15, ge=0, description="Context in parts of the box's longer side.")
+    margin_px: float = Field(
+        default=20.0, ge=0, description="Context around a box in its crop, pixels at least."
+    )
+    margin_fraction: float = Field(
+        default=0.15, ge=0, description="Context in parts of the box's longer side."
+    )
     lidar_points: int = Field(
-        0, ge=0, description="Returns given to the SAM-style segmenter besides the box; the paper gives none."
+        default=0,
+        ge=0,
+        description="Returns given to the SAM-style segmenter besides the box; the paper gives none.",
     )
     exclusive: bool = Field(
-        True, description="A pixel that several masks claim belongs to the nearest actor."
+        default=True, description="A pixel that several masks claim belongs to the nearest actor."
     )
     anchor_tracks: bool = Field(
-        True, description="Date moving actors' boxes by the LiDAR points inside them before projecting."
+        default=True,
+        description="Date moving actors' boxes by the LiDAR points inside them before projecting.",
     )
-    overlays: int = Field(4, ge=0, description="Pictures of masks over whole images.")
-    threads: int | None = Field(None, ge=1, description="Threads of the segmenter; none: every core.")
+    overlays: int = Field(default=4, ge=0, description="Pictures of masks over whole images.")
+    threads: int | None = Field(default=None, ge=1, description="Threads of the segmenter; none: every core.")
 
     @model_validator(mode="after")
     def _files_come_as_a_pair(self) -> PrepareMasksConfig:
