@@ -302,6 +302,15 @@ def _metrics(rows: list[dict[str, Any]], segmenter: str) -> list[Metric]:
     return metrics
 
 
+def pretrained_files(config: PrepareMasksConfig) -> dict[str, str]:
+    """State of the pinned files: with "auto" they decide which segmenter makes the masks."""
+    from genassets import weights
+
+    if config.segmenter == "grabcut" or config.encoder is not None:
+        return {}
+    return {name: weights.status(name).state for name in ("sam-encoder", "sam-decoder")}
+
+
 STAGE = Stage(
     name="prepare_masks",
     version=1,
@@ -319,4 +328,5 @@ STAGE = Stage(
     sharded=True,
     summary="the object table, with masks where they are asked for",
     runtime_only=frozenset({"threads"}),
+    reads=pretrained_files,
 )
