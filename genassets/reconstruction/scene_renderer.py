@@ -87,7 +87,8 @@ class SceneRenderer:
         for top in range(fy0, fy1, rows_at_once):
             rays = region_rays(view, (fx0, top, fx1, min(top + rows_at_once, fy1)), stride)
             culled = cull(rays, coarse, self._settings)
-            fields = self._fields(culled.actors(rays).tolist())
+            met = torch.nonzero(culled.samples_of_actors(rays))[:, 0].tolist()
+            fields = self._fields(met or [0])  # one stands in where none is met
             strips.append(render_rays(rays, culled, fields, background, self._settings).feature)
         feature_map = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
         image = self.library.model.rgb(feature_map)[0].permute(1, 2, 0).numpy()

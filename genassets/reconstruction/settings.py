@@ -56,8 +56,8 @@ class RenderingSettings(_Settings):
 
     actor_step: PositiveFloat = 0.10
     actor_growth: Weight = 0.005
-    background_step: PositiveFloat = 0.80
-    background_growth: Weight = 0.08
+    background_step: PositiveFloat = 1.0
+    background_growth: Weight = 0.1
     background_near: PositiveFloat = 1.0
     background_far: PositiveFloat = 80.0
     sky_samples: Annotated[int, Field(ge=1)] = 8
@@ -96,9 +96,12 @@ class ReconstructionSettings(_Settings):
         0.25, description="size of rendered images as a share of the log's images"
     )
     steps: PositiveInt = 1500
-    patches: PositiveInt = 8
+    patches: PositiveInt = 5
     views_at_once: PositiveInt = Field(2, description="views that the patches of a step come from")
-    patch_size: PositiveInt = Field(24, description="side of a training patch in feature pixels")
+    decoded_actors: PositiveInt = Field(
+        12, description="actors decoded and learned in a step; others that rays meet keep the planes they had"
+    )
+    patch_size: PositiveInt = Field(32, description="side of a training patch in feature pixels")
     patch_margin: Annotated[int, Field(ge=0)] = Field(
         2, description="feature pixels rendered around a patch as context for the image network"
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,6 +63,9 @@ class Trainer:
         self.model, self.data, self.settings, self.seed = model, data, settings, seed
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
+        self.planes = torch.cat(
+            [planes.half() for _, planes in decode_all(model)]
+        )  # of every actor, as last decoded: what a step that only looks past an actor uses
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99))
@@ -106,9 +109,12 @@ class Trainer:
         model, settings = self.model, self.settings
         rendering = render_settings(settings.rendering)
         culled = cull(batch.rays, model.coarse_actors(), rendering, generator)
-        actors = culled.actors(batch.rays)
+        actors, bystanders = self._split_actors(culled.samples_of_actors(batch.rays))
         latents = model.latents(actors, generator)
-        fields = model.actor_fields(actors, model.decode(actors, latents.code))
+        decoded = model.decode(actors, latents.code)
+        self.planes[actors] = decoded.detach().half()
+        planes = torch.cat((decoded, self.planes[bystanders].float()))
+        fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
         if self.step % settings.rendering.coarse_refresh == 0:
             stalest = int(actors[self.refreshed[actors].argmin()])
             model.refresh_coarse_distance(stalest, fields)
@@ -126,6 +132,13 @@ class Trainer:
             distance = rendered.distance[camera_rays:]
             losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
         return StepResult(losses, actors, rendered.counts)
+
+    def _split_actors(self, samples: Tensor) -> tuple[Tensor, Tensor]:
+        """Actors to decode and learn from, those with most samples; and the others that are met."""
+        order = torch.argsort(samples, descending=True, stable=True)
+        met = order[: max(int((samples > 0).sum()), 1)]
+        learned = self.settings.decoded_actors
+        return met[:learned].sort().values, met[learned:].sort().values
 
     def _set_rates(self) -> None:
         final = self.settings.rates.final
@@ -150,6 +163,7 @@ class Trainer:
         return {
             "step": self.step,
             "refreshed": self.refreshed,
+            "planes": self.planes,
             "model": self.model.state_dict(),
             "dense": self.dense.state_dict(),
             "sparse": self.sparse.state_dict(),
@@ -159,9 +173,17 @@ class Trainer:
         """Continue from a state."""
         self.step = int(state["step"])
         self.refreshed = state["refreshed"]
+        self.planes = state["planes"]
         self.model.load_state_dict(state["model"])
         self.dense.load_state_dict(state["dense"])
         self.sparse.load_state_dict(state["sparse"])
+
+
+@torch.no_grad()
+def decode_all(model: AssetModel, at_once: int = 16) -> Iterator[tuple[Tensor, Tensor]]:
+    """Every actor's index and planes from its mean code, some at a time."""
+    for actors in torch.arange(len(model.sizes)).split(at_once):
+        yield actors, model.decode(actors, model.latents(actors).code)
 
 
 def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
@@ -208,8 +230,8 @@ def train(
         step = trainer.step
         if step % CURVE_EVERY == 0 or step == settings.steps:
             for term, value in result.losses.items():
-                curve(f"loss/{term}", step, float(value))
-            psnr = -10 * math.log10(max(float(result.losses["rgb"]), 1e-10))
+                curve(f"loss/{term}", step, value.item())
+            psnr = -10 * math.log10(max(result.losses["rgb"].item(), 1e-10))
             curve("training/patch_psnr", step, psnr)
             curve("training/samples_shaded", step, result.counts.shaded)
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from genassets.fields.shape_prior import rounded_box_distance
+from genassets.fields.shape_prior import bounded_distance
 from genassets.rendering.renderer import ActorFields, actor_distance, padded_half_size
 from genassets.rendering.sampling import OccupancyGrid
 
@@ -24,7 +24,7 @@ def prior_distance(size: Float[Tensor, "actors 3"], resolution: int) -> Float[Te
     """Coarse distance in metres of untrained actors: the rounded box that they start at."""
     centres = cell_centres(resolution)
     grids = [
-        rounded_box_distance(centres * half, one.expand(len(centres), 3))
+        bounded_distance(centres * half, one.expand(len(centres), 3), torch.zeros(len(centres)))
         for half, one in zip(padded_half_size(size), size, strict=True)
     ]
     return torch.stack(grids).reshape(len(size), resolution, resolution, resolution)

@@ -15,7 +15,7 @@ from torch import Tensor
 from genassets.fields.background import contract
 from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import log_transmittance
-from genassets.fields.shape_prior import rounded_box_distance
+from genassets.fields.shape_prior import bounded_distance
 from genassets.fields.triplane import interpolate_triplanes
 from genassets.rendering.compositing import OPAQUE, accumulate, depth_order, log_light, render_weights
 from genassets.rendering.rays import BOX_PADDING, Rays
@@ -102,10 +102,9 @@ class Culled:
     samples: ActorSamples
     in_boxes: int
 
-    def actors(self, rays: Rays) -> Int[Tensor, " met"]:
-        """The actors to decode: those with a sample left. One stands in where there is none."""
-        met = torch.unique(rays.hits.actor[self.samples.hit])
-        return met if len(met) else met.new_zeros(1)
+    def samples_of_actors(self, rays: Rays) -> Int[Tensor, " actors"]:
+        """How many samples each actor has left, by index, up to the last actor that has any."""
+        return torch.bincount(rays.hits.actor[self.samples.hit], minlength=1)
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,7 @@ def actor_distance(
     coordinates = position / padded_half_size(actors.size)[actor]
     features = interpolate_triplanes(actors.planes, actors.slot[actor], coordinates)
     residual, intermediate = actors.field.distance(features)
-    return rounded_box_distance(position, actors.size[actor]) + residual, intermediate
+    return bounded_distance(position, actors.size[actor], residual), intermediate
 
 
 def padded_half_size(size: Float[Tensor, "actors 3"]) -> Float[Tensor, "actors 3"]:
