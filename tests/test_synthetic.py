@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from genassets.city_spec import CitySpec
 from genassets.driving import CLASSES, class_of, open_log
 from genassets.driving.synthetic.actors import Actor
 from genassets.driving.synthetic.fleet import STYLES, Model, build_model, ego_model, in_box_frame
@@ -17,7 +18,6 @@ from genassets.driving.synthetic.lighting import draw_light
 from genassets.driving.synthetic.materials import Kind, glow_table
 from genassets.driving.synthetic.mesh import MeshBuilder, add_box
 from genassets.driving.synthetic.rig import CAMERA_RIG, FORWARD_SPAN, SPINNING_SPAN, spinning_time
-from genassets.driving.synthetic.spec import CitySpec
 from genassets.driving.synthetic.sweeps import cast_sweep
 from genassets.driving.synthetic.synthesize import lidar_view, make_scene, synthesize_log
 from genassets.driving.synthetic.tracing import Placed, Solid, TracedCity

@@ -24,7 +24,7 @@ SEED = 1
 
 def run(say: Callable[[str], None]) -> Sequence[Row]:
     """Synthesize a log of 8 frames at 960 x 540 and measure on its front camera."""
-    from genassets.driving.synthetic.spec import CitySpec
+    from genassets.city_spec import CitySpec
     from genassets.driving.synthetic.synthesize import synthesize_log
 
     with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from genassets.driving.synthetic.spec import CitySpec
+from genassets.city_spec import CitySpec
 from genassets.errors import EnvironmentProblem, SpecError
 from genassets.specs.document import Document, KeyPath
 from genassets.specs.log_source import LogName, PandasetSource, SyntheticSource

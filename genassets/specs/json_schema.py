@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from genassets.driving.synthetic.spec import CitySpec
+from genassets.city_spec import CitySpec
 from genassets.specs.dataset import PandasetDataset, SyntheticCityDataset
 from genassets.specs.experiment import SHARED_FIELDS, ExperimentHeader
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genassets.city_spec import CitySpec
 from genassets.driving.synthetic.fleet import Model, draw_model
 from genassets.driving.synthetic.layout import (
     CROSS_HALF,
@@ -19,7 +20,6 @@ from genassets.driving.synthetic.layout import (
     STREET_HALF,
     CityLayout,
 )
-from genassets.driving.synthetic.spec import CitySpec
 from genassets.driving.synthetic.trajectories import LEAD_IN, Path, braking, parked, straight
 
 Float = NDArray[np.float64]

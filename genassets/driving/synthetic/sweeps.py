@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from genassets.city_spec import CitySpec
 from genassets.driving.synthetic.materials import RETROREFLECTION, Kind
 from genassets.driving.synthetic.rig import (
     FORWARD_AZIMUTHS,
@@ -18,7 +19,6 @@ from genassets.driving.synthetic.rig import (
     forward_time,
     spinning_time,
 )
-from genassets.driving.synthetic.spec import CitySpec
 from genassets.driving.synthetic.tracing import Solid, TracedCity
 from genassets.driving.synthetic.trajectories import Path
 

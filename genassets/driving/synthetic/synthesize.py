@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from genassets.city_spec import CitySpec
 from genassets.driving.pandaset_writer import PandasetWriter, WrittenCamera, WrittenCuboid
 from genassets.driving.synthetic.actors import Actor, make_uuid, populate
 from genassets.driving.synthetic.city import build_city
@@ -27,7 +28,6 @@ from genassets.driving.synthetic.rig import (
     forward_time,
     spinning_time,
 )
-from genassets.driving.synthetic.spec import CitySpec
 from genassets.driving.synthetic.sweeps import Returns, cast_sweep
 from genassets.driving.synthetic.tracing import Placed, Solid, TracedCity
 from genassets.driving.synthetic.trajectories import Path as Drive

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from genassets.city_spec import CitySpec
 from genassets.driving.synthetic.layout import CROSS_LANE_X, EGO_LANE_Y, CityLayout
-from genassets.driving.synthetic.spec import CitySpec
 
 Float = NDArray[np.float64]
 RIGHT_TURN_RADIUS = 7.6

@@ -1,4 +1,7 @@
-"""What a synthetic city log looks like: the settings, their ranges, nothing heavy to import."""
+"""What a log of the synthetic city looks like: the settings and their ranges.
+
+It lies outside genassets.driving, so that reading a spec imports no numpy.
+"""
 
 from __future__ import annotations
 
