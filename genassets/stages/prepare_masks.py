@@ -82,10 +82,6 @@ class PrepareMasksConfig(BaseModel):
     exclusive: bool = Field(
         default=True, description="A pixel that several masks claim belongs to the nearest actor."
     )
-    anchor_tracks: bool = Field(
-        default=True,
-        description="Date moving actors' boxes by the LiDAR points inside them before projecting.",
-    )
     overlays: int = Field(default=4, ge=0, description="Pictures of masks over whole images.")
     threads: int | None = Field(default=None, ge=1, description="Threads of the segmenter; none: every core.")
 
@@ -104,15 +100,12 @@ def run(inputs: Inputs, config: PrepareMasksConfig, out: Path, context: StageCon
     from genassets.curation.object_table import write_object_table
     from genassets.curation.observations import actor_returns, observe
     from genassets.curation.occlusion import occluded_fractions
-    from genassets.driving import anchor_tracks
     from genassets.driving.synthetic.truth import open_truth
     from genassets.masks.crops import CropSettings
     from genassets.masks.selection import choose_segmenter
     from genassets.stages.ingested import open_ingested
 
     log = open_ingested(inputs.one("ingest"))
-    if config.anchor_tracks:
-        log = anchor_tracks(log)
     truth = open_truth(log.root)
     request = MaskRequest(
         cameras=_cameras(log, config),
