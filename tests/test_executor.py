@@ -104,9 +104,10 @@ def test_an_allowed_fraction_of_failed_shards(tmp_path: Path) -> None:
 
 
 SCRIPT = """
-    import sys
+    import signal, sys
     from pathlib import Path
     from tests.toy_pipeline import run_toy
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start without it
     code, record = run_toy(Path(sys.argv[1]), [f"numbers.kill_at={sys.argv[2]}", f"numbers.armed={sys.argv[3]}"])
     print(record.status, record.error)
     sys.exit(code)
