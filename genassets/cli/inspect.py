@@ -71,7 +71,10 @@ def _draw(log: Log, frames: list[int], out: Path, full_size: bool) -> list[str]:
 
     out.mkdir(parents=True, exist_ok=True)
     written = []
-    for frame in track(frames, description="drawing", transient=True, console=_error_console()):
+    console = _error_console()
+    for frame in track(
+        frames, description="drawing", transient=True, console=console, disable=not console.is_terminal
+    ):
         overlays = draw_frame(log, frame)
         pictures = {f"frame_{frame:02d}.jpg": draw_sheet(log, frame, overlays=overlays)}
         if full_size:
