@@ -17,7 +17,7 @@ from genassets.cli import app as cli
 from genassets.driving.portable_pickle import pickle_table
 from genassets.driving.unpickle import read_table
 
-WRONG_SPEC, FAILED = 2, 3
+WRONG_SPEC, FAILED, REFUSED_BY_THE_SYSTEM = 2, 3, 6
 SPEC = """\
 name: tiny
 dataset:
@@ -254,3 +254,13 @@ def test_a_wrong_spec_is_named_by_line_before_anything_is_made(
     assert code == WRONG_SPEC
     assert message in said
     assert not (tmp_path / "home").exists()
+
+
+def test_a_home_that_cannot_be_made_is_one_message(
+    tmp_path: Path, root: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("GENASSETS_HOME", str(tmp_path / "file" / "home"))
+    code, said = call(*run_spec(tmp_path))
+    assert code == REFUSED_BY_THE_SYSTEM
+    assert len(said.splitlines()) == 1 and "Not a directory" in said and "file/home" in said

@@ -98,6 +98,16 @@ def _without(field: str) -> Callable[[Any], Any]:
         ),
         ("lidar/poses", lambda e: {"poses": e}, "expected a list"),
         ("lidar/timestamps", lambda e: [e[0], "late"], "entry 1 is 'late'"),
+        (
+            "lidar/timestamps",
+            lambda e: [e[0], 10**400],
+            "entry 1 is 10000.*; expected a number of less than 1e",
+        ),
+        (
+            "lidar/poses",
+            lambda e: [e[0], {**e[1], "position": {"x": 1e300, "y": 0, "z": 0}}],
+            "entry 1: position.x is 1e.300",
+        ),
         ("camera/front_camera/intrinsics", _without("cy"), "fx, fy, cx, cy"),
         ("camera/front_camera/intrinsics", lambda e: {**e, "fx": -3.0}, "focal lengths above 0"),
     ],
@@ -107,6 +117,12 @@ def test_bad_numbers_in_json_are_named(
 ) -> None:
     edit_json(root / f"{name}.json", change)
     with pytest.raises(LogError, match=f"{name}.json: .*{message}"):
+        open_log(root)
+
+
+def test_json_nested_without_end_is_named(root: Path) -> None:
+    (root / "lidar/poses.json").write_text("[" * 100_000)
+    with pytest.raises(LogError, match="poses.json: cannot be read as JSON"):
         open_log(root)
 
 

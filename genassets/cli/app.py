@@ -27,7 +27,7 @@ from genassets.cli.run import run
 from genassets.cli.schema import schema
 from genassets.cli.status import status
 from genassets.cli.verify import verify
-from genassets.errors import GenAssetsError
+from genassets.errors import EnvironmentProblem, GenAssetsError
 
 app = typer.Typer(
     name="genassets",
@@ -81,13 +81,14 @@ app.add_typer(weights.app, name="weights")
 def main() -> None:
     """Run the `genassets` command and end the process with its exit code.
 
-    A GenAssetsError ends as its message on standard error and its exit code; typer ends with 2 for a wrong
-    command line and 130 for Ctrl-C.
+    A GenAssetsError ends as its message on standard error and its exit code; what the system refuses (a
+    directory that cannot be made, a full disk) ends likewise, with 6; typer ends with 2 for a wrong command
+    line and 130 for Ctrl-C.
     """
     try:
         app()
-    except GenAssetsError as error:
+    except (GenAssetsError, OSError) as error:
         if os.environ.get("GENASSETS_TRACEBACK", "0") not in ("", "0"):
             traceback.print_exc()
         print(f"genassets: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        sys.exit(error.exit_code if isinstance(error, GenAssetsError) else EnvironmentProblem.exit_code)

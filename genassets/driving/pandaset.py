@@ -24,6 +24,7 @@ from genassets.geometry.transforms import make_pose, rotation_from_quaternion
 
 FLU_IN_LIDAR = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # columns: forward, left, up
 FLU_IN_CAMERA = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+LARGEST_NUMBER = 1e12  # far above metres, pixels and seconds since 1970, and safe to square
 FORWARD_COSINE = 0.9  # the front camera looks at least this much along the car's forward axis
 
 _AGAIN = "Download the file again or correct it."
@@ -102,7 +103,7 @@ def _read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise LogError(f"{path}: the file is missing; a PandaSet sequence has it. {_AGAIN}") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise LogError(f"{path}: cannot be read as JSON ({error}). {_AGAIN}") from error
 
 
@@ -116,8 +117,11 @@ def _read_list(path: Path, length: int | None) -> list[Any]:
 
 
 def _number(path: Path, field: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise LogError(f"{path}: {field} is {value!r}; expected a finite number. {_AGAIN}")
+    # Also not nan, as every comparison with nan is false; Python's whole numbers have no limit of their own.
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST_NUMBER:
+        raise LogError(
+            f"{path}: {field} is {repr(value)[:40]}; expected a number of less than {LARGEST_NUMBER:g}. {_AGAIN}"
+        )
     return float(value)
 
 

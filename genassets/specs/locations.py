@@ -37,7 +37,7 @@ def find_spec(kind: str, name: str, root: Path | None = None) -> Path:
     if name.endswith((".yaml", ".yml")) or os.sep in name:
         path = Path(name)
         if not path.is_file():
-            raise SpecError(f"{path}: no such file")
+            raise SpecError(f"{path}: no such file; expected an experiment's YAML file")
         return path
     folder = (root or data_specs_root()) / kind
     path = folder / f"{name}.yaml"
