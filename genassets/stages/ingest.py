@@ -112,7 +112,12 @@ STAGE = Stage(
     version=1,
     config=Config,
     needs=(),
-    modules=("genassets.city_spec", "genassets.driving", "genassets.export.picture_list", "genassets.geometry"),
+    modules=(
+        "genassets.city_spec",
+        "genassets.driving",
+        "genassets.export.picture_list",
+        "genassets.geometry",
+    ),
     run=run,
     sharded=True,
     summary="Synthesize or check the driving log",
