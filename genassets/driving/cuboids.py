@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from genassets.driving.classes import class_of
 from genassets.driving.log import Track
+from genassets.driving.sweep import SPINNING_POSITION
 from genassets.driving.unpickle import read_table
 from genassets.errors import LogError
 from genassets.geometry.transforms import invert_pose, transform_points, yaw_pose
 
 SPIN_SECONDS = 0.1  # the spinning LiDAR turns at 10 Hz
-# lidar/poses.json has its origin 0.4 m above the road, and the spinning LiDAR stands this far in front of
-# it, in metres: fitted to the stamps and bearings of sequence 002's points (0.75 m while the car stands).
-SPIN_AXIS_FORWARD = 0.75
 # Annotators' sizes jitter along a track: a high quantile is a maximum without the outliers.
 SIZE_QUANTILE = 0.9
 
@@ -179,7 +177,7 @@ def spin_offset(world_from_lidar: NDArray[np.float64], point: tuple[float, float
     cameras' (front -50 ms, back -100 ms).
     """
     x, y, _ = transform_points(invert_pose(world_from_lidar), point)
-    turned = np.arctan2(y - SPIN_AXIS_FORWARD, x) + np.pi / 2
+    turned = np.arctan2(y - SPINNING_POSITION[0], x) + np.pi / 2
     return -SPIN_SECONDS * float(turned % (2 * np.pi)) / (2 * np.pi)
 
 

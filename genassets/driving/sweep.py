@@ -13,6 +13,10 @@ from genassets.errors import LogError
 from genassets.geometry.transforms import invert_pose, transform_points
 
 SPINNING, FORWARD = 0, 1
+# The spinning LiDAR's place in the ego frame, forward, left and up in metres: lidar/poses.json has its origin
+# 0.4 m above the road. Forward: fitted to the stamps and bearings of sequence 002's points while the car stands;
+# up: where the elevations of its returns fall on the beams' 1/6 degree steps, above the front camera's 1.81 m.
+SPINNING_POSITION = (0.75, 0.0, 1.95)
 # Half extents around the LiDAR (its x right, y forward, z up), in metres, within which returns are the ego
 # car's.
 EGO_HALF_EXTENT = (1.0, 2.0, 2.0)

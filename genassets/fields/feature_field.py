@@ -11,7 +11,8 @@ from torch import Tensor, nn
 class FeatureField(nn.Module):
     """Triplane features to an SDF value, and with the view direction to a neural feature (paper eq. 1).
 
-    The two are called apart, so that the feature is computed only for the samples that are seen.
+    The two are called apart, so that the feature is computed only for the samples that are seen. A linear
+    path from planes to feature stands beside the network: texture is learned through it in few steps.
     """
 
     def __init__(self, inputs: int, hidden: int, features: int, direction_frequencies: int = 2) -> None:
@@ -29,6 +30,7 @@ class FeatureField(nn.Module):
             nn.ReLU(),
             nn.Linear(hidden, features),
         )
+        self.direct = nn.Linear(inputs, features, bias=False)
         distance = self.geometry[-1]
         assert isinstance(distance, nn.Linear)
         with torch.no_grad():  # start at the shape prior: no distance of its own
@@ -37,17 +39,20 @@ class FeatureField(nn.Module):
 
     def distance(
         self, plane_features: Float[Tensor, "samples inputs"]
-    ) -> tuple[Float[Tensor, " samples"], Float[Tensor, "samples hidden"]]:
-        """Signed distance in metres, relative to the caller's shape prior, and the intermediate feature."""
+    ) -> tuple[Float[Tensor, " samples"], Float[Tensor, "samples intermediate"]]:
+        """Signed distance in metres, relative to the caller's shape prior, and what the feature is made of."""
         out = self.geometry(plane_features)
-        return out[:, 0], out[:, 1:]
+        return out[:, 0], torch.cat((out[:, 1:], plane_features), dim=-1)
 
     def feature(
-        self, intermediate: Float[Tensor, "samples hidden"], directions: Float[Tensor, "samples 3"]
+        self, intermediate: Float[Tensor, "samples intermediate"], directions: Float[Tensor, "samples 3"]
     ) -> Float[Tensor, "samples features"]:
         """Neural feature seen along unit directions in the field's own frame."""
+        hidden, plane_features = intermediate.tensor_split(
+            [intermediate.shape[1] - self.direct.in_features], dim=1
+        )
         encoded = encode_directions(directions, self.direction_frequencies)
-        return self.appearance(torch.cat((F.relu(intermediate), encoded), dim=-1))
+        return self.appearance(torch.cat((F.relu(hidden), encoded), dim=-1)) + self.direct(plane_features)
 
 
 def encode_directions(

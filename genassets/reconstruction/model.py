@@ -21,7 +21,7 @@ from genassets.rendering.rgb_network import RgbNetwork
 from genassets.rendering.sampling import OccupancyGrid
 
 LATENT_SPREAD = 0.1
-LOG_VARIANCE_START = -4.0
+LOG_VARIANCE_START = -6.0
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class AssetModel(nn.Module):
                 settings.rgb_blocks,
                 settings.rgb_upsamplings,
             )
-        self.beta = Sharpness()
+        self.beta = Sharpness(settings.sharpness)
         self.background_beta = Sharpness()
         self.backgrounds = nn.ModuleList(
             BackgroundPlanes(settings.background_resolution, settings.background_plane_channels, generator)

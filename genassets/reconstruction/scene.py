@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genassets.driving import Log
+from genassets.driving.sweep import SPINNING_POSITION
 from genassets.geometry.boxes import points_in_box
 from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
-from genassets.geometry.transforms import invert_pose, transform_directions
+from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 
 Array = NDArray[np.float64]
 
@@ -151,7 +152,7 @@ def lidar_rays(
     The forward LiDAR is left out: PandaSet gives no pose of it, so its rays' origins are not known.
     """
     sweep = log.sweep(frame)
-    origin = scene.pose(sweep.world_from_lidar)[:3, 3]
+    origin = transform_points(scene.pose(log.world_from_ego[frame]), SPINNING_POSITION)
     points = sweep.points[sweep.sensor == 0] - scene.origin
     offset = points - origin
     distance = np.linalg.norm(offset, axis=1)

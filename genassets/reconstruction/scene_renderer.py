@@ -91,7 +91,7 @@ class SceneRenderer:
             fields = self._fields(met or [0])  # one stands in where none is met
             strips.append(render_rays(rays, culled, fields, background, self._settings).feature)
         feature_map = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
-        image = self.library.model.rgb(feature_map)[0].permute(1, 2, 0).numpy()
+        image = self.library.model.rgb(feature_map).clamp(0, 1)[0].permute(1, 2, 0).numpy()
         left, top = x0 - fx0 * stride, y0 - fy0 * stride
         return image[top : top + y1 - y0, left : left + x1 - x0]
 
@@ -121,7 +121,7 @@ class SceneRenderer:
         grid = (1, height + 2 * CONTEXT, width + 2 * CONTEXT, -1)
         maps = torch.cat(parts).reshape(grid).permute(0, 3, 1, 2)
         feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
-        rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3))
+        rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3)).clamp(0, 1)
         alpha, distance = (
             torch.nn.functional.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False)
             for m in (alpha, distance)

@@ -23,6 +23,7 @@ class ModelSettings(_Settings):
     decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)
     plane_channels: PositiveInt = 8
     field_hidden: PositiveInt = 48
+    sharpness: PositiveFloat = Field(20.0, description="beta at the start, in 1/m")
     features: PositiveInt = 16
     background_resolution: PositiveInt = 192
     background_plane_channels: PositiveInt = 8
@@ -73,10 +74,10 @@ class LearningRates(_Settings):
     """Adam's rates at the start; all fall along a half cosine to `final` times their start."""
 
     latent: PositiveFloat = 0.05
-    decoder: PositiveFloat = 1e-3
-    field: PositiveFloat = 2e-3
+    decoder: PositiveFloat = 2e-3
+    field: PositiveFloat = 5e-3
     sharpness: PositiveFloat = 0.05
-    background: PositiveFloat = 1e-2
+    background: PositiveFloat = 5e-2
     rgb: PositiveFloat = 2e-3
     final: Annotated[float, Field(gt=0, le=1)] = 0.05
 
@@ -96,7 +97,7 @@ class ReconstructionSettings(_Settings):
         0.25, description="size of rendered images as a share of the log's images"
     )
     steps: PositiveInt = 1500
-    patches: PositiveInt = 5
+    patches: PositiveInt = 4
     views_at_once: PositiveInt = Field(2, description="views that the patches of a step come from")
     decoded_actors: PositiveInt = Field(
         12, description="actors decoded and learned in a step; others that rays meet keep the planes they had"
@@ -108,7 +109,7 @@ class ReconstructionSettings(_Settings):
     background_share: Annotated[float, Field(ge=0, le=1)] = Field(
         0.15, description="share of patches placed anywhere in an image rather than on an actor"
     )
-    lidar_rays: Annotated[int, Field(ge=0)] = 512
+    lidar_rays: Annotated[int, Field(ge=0)] = 256
     lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.05, description="share of the largest LiDAR residuals left out of a batch"
     )

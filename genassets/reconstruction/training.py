@@ -68,7 +68,7 @@ class Trainer:
         )  # of every actor, as last decoded: what a step that only looks past an actor uses
         rates = settings.rates
         groups = parameter_groups(model, rates)
-        self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99))
+        self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
         codes = [model.latent_mean.weight, model.latent_log_variance.weight]
         self.sparse = torch.optim.SparseAdam([{"params": codes, "lr": rates.latent}], betas=(0.9, 0.99))
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]

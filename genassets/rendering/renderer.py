@@ -289,10 +289,13 @@ def _may_be_seen(samples: ActorSamples, rays: Rays, coarse: CoarseActors) -> Boo
     flat = ((actor * resolution + cell[:, 0]) * resolution + cell[:, 1]) * resolution + cell[:, 2]
     distance = coarse.distance.reshape(-1)[flat]
     radius = torch.linalg.vector_norm(half / resolution, dim=-1)[actor]
-    absorbed = log_transmittance(distance + radius, coarse.beta, samples.step, ACTOR_REFERENCE_STEP)
-    ray = rays.hits.ray[samples.hit]
-    order = depth_order(ray, samples.distance)
-    before = torch.empty_like(absorbed)
-    before[order] = log_light(absorbed[order], ray[order]).to(absorbed.dtype)
-    in_the_clear = coarse.beta * (distance - radius) > CLEAR_BEYOND
-    return ~in_the_clear & (before > LOG_HIDDEN)
+    near_surface = torch.nonzero(coarse.beta * (distance - radius) <= CLEAR_BEYOND)[:, 0]
+    absorbed = log_transmittance(
+        (distance + radius)[near_surface], coarse.beta, samples.step[near_surface], ACTOR_REFERENCE_STEP
+    )
+    ray = rays.hits.ray[samples.hit[near_surface]]
+    order = depth_order(ray, samples.distance[near_surface])
+    lit = log_light(absorbed[order], ray[order]) > LOG_HIDDEN
+    keep = torch.zeros(len(samples.hit), dtype=torch.bool, device=ray.device)
+    keep[near_surface[order[lit]]] = True
+    return keep

@@ -12,8 +12,9 @@ class RgbNetwork(nn.Module):
     """Residual blocks without normalisation, with 2x upsampling after the second and the fourth.
 
     No normalisation, because patches in training have other statistics than whole frames. upsamplings is 0,
-    1 or 2: the factor between feature map and image is 2^upsamplings. The paper: 6 blocks, 32 channels,
-    kernel 5, two upsamplings.
+    1 or 2: the factor between feature map and image is 2^upsamplings. The first three features are taken for
+    a coarse image that the network adds detail to, so that colours are learned from the first step on.
+    The paper: 6 blocks, 32 channels, kernel 5, two upsamplings.
     """
 
     def __init__(self, features: int, channels: int, kernel: int, blocks: int, upsamplings: int) -> None:
@@ -26,15 +27,18 @@ class RgbNetwork(nn.Module):
         self.head = nn.Conv2d(features, channels, 1)
         self.blocks = nn.ModuleList(_Block(channels, kernel) for _ in range(blocks))
         self.image = nn.Conv2d(channels, 3, kernel, padding=kernel // 2, padding_mode="replicate")
+        nn.init.zeros_(self.image.weight)
+        nn.init.zeros_(self.image.bias)  # type: ignore[arg-type]
 
     def forward(self, feature_map: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 height width"]:
-        """Images in [0, 1]."""
+        """Images around [0, 1], not clipped: a clipped pixel would have no gradient."""
         x = self.head(feature_map.contiguous(memory_format=torch.channels_last))
         for index, block in enumerate(self.blocks):
             x = block(x)
             if index in self.upsample_after:
                 x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
-        return torch.sigmoid(self.image(x))
+        coarse = F.interpolate(feature_map[:, :3], x.shape[-2:], mode="bilinear", align_corners=False)
+        return 0.5 + coarse + self.image(x)
 
 
 class _Block(nn.Module):

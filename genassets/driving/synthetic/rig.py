@@ -55,7 +55,6 @@ CAMERA_RIG: dict[str, Mount] = {
     ),
 }
 
-SPINNING_POSITION = np.array([0.0, 0.0, 1.90])
 FORWARD_POSITION = np.array([0.60, 0.0, 1.60])
 
 # Pandar64's beams, degrees above the horizon: 1/6 degree apart where cars are, coarse above and below.

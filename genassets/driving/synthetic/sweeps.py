@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genassets.city_spec import CitySpec
+from genassets.driving.sweep import SPINNING_POSITION
 from genassets.driving.synthetic.materials import RETROREFLECTION, Kind
 from genassets.driving.synthetic.rig import (
     FORWARD_AZIMUTHS,
     FORWARD_ELEVATIONS,
     FORWARD_POSITION,
     SPINNING_ELEVATIONS,
-    SPINNING_POSITION,
     forward_time,
     spinning_time,
 )
@@ -71,7 +71,7 @@ def cast_sweep(
     ego_car, in the ego frame, hides what is behind it and gives no returns of its own.
     """
     views = (
-        (spinning_pattern(spec.spinning_columns), spinning_time, SPINNING_POSITION, SPINNING_GAIN),
+        (spinning_pattern(spec.spinning_columns), spinning_time, np.array(SPINNING_POSITION), SPINNING_GAIN),
         (
             forward_pattern(spec.forward_columns, spec.forward_rows),
             forward_time,
