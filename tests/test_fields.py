@@ -120,4 +120,5 @@ def test_paper_decoder_has_the_papers_shapes() -> None:
     code = torch.zeros(1, 32, 8, 8)
     with torch.no_grad():
         assert decoder(code, code).shape == (1, 3, 12, 128, 128)
-    assert decoder.blocks[0].norm1.num_groups == 32
+    norm = decoder.blocks[0].get_submodule("norm1")
+    assert isinstance(norm, torch.nn.GroupNorm) and norm.num_groups == 32

@@ -54,8 +54,8 @@ class AssetLibrary:
 
     def indices_of_log(self, log_name: str) -> dict[str, int]:
         """Row of every actor of a log, by actor id."""
-        rows = self.assets[self.assets["log"] == log_name]
-        return {str(actor_id): int(row) for row, actor_id in rows["actor_id"].items()}
+        rows = np.flatnonzero(self.assets["log"] == log_name)
+        return {str(self.assets["actor_id"].iloc[row]): int(row) for row in rows}
 
 
 def save_library(library: AssetLibrary, directory: Path) -> None:

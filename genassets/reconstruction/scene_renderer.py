@@ -133,7 +133,7 @@ class SceneRenderer:
             return inside.permute(1, 2, 0).numpy()
 
         opacity = crop(alpha)
-        depth = crop(distance) / np.maximum(opacity, 1e-6)
+        depth = (crop(distance) / np.maximum(opacity, 1e-6)).astype(np.float32)
         return ActorView(crop(rgb) * opacity, opacity[..., 0], depth[..., 0])
 
     @torch.no_grad()

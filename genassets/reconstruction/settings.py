@@ -23,7 +23,7 @@ class ModelSettings(_Settings):
     decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)
     plane_channels: PositiveInt = 8
     field_hidden: PositiveInt = 48
-    sharpness: PositiveFloat = Field(20.0, description="beta at the start, in 1/m")
+    sharpness: PositiveFloat = Field(default=20.0, description="beta at the start, in 1/m")
     features: PositiveInt = 16
     background_resolution: PositiveInt = 192
     background_plane_channels: PositiveInt = 8
@@ -66,7 +66,7 @@ class RenderingSettings(_Settings):
     occupancy_cell: PositiveFloat = 0.5
     occupancy_dilation: Annotated[int, Field(ge=0)] = 1
     coarse_refresh: PositiveInt = Field(
-        2, description="steps between refreshes of one actor's coarse distance"
+        default=2, description="steps between refreshes of one actor's coarse distance"
     )
 
 
@@ -94,27 +94,28 @@ class ReconstructionSettings(_Settings):
     """One reconstruction: what is rendered, with which model, for how long."""
 
     image_scale: Annotated[float, Field(gt=0, le=1)] = Field(
-        0.25, description="size of rendered images as a share of the log's images"
+        default=0.25, description="size of rendered images as a share of the log's images"
     )
     steps: PositiveInt = 1500
     patches: PositiveInt = 4
-    views_at_once: PositiveInt = Field(2, description="views that the patches of a step come from")
+    views_at_once: PositiveInt = Field(default=2, description="views that the patches of a step come from")
     decoded_actors: PositiveInt = Field(
-        12, description="actors decoded and learned in a step; others that rays meet keep the planes they had"
+        default=12,
+        description="actors decoded and learned in a step; others that rays meet keep the planes they had",
     )
-    patch_size: PositiveInt = Field(32, description="side of a training patch in feature pixels")
+    patch_size: PositiveInt = Field(default=32, description="side of a training patch in feature pixels")
     patch_margin: Annotated[int, Field(ge=0)] = Field(
-        2, description="feature pixels rendered around a patch as context for the image network"
+        default=2, description="feature pixels rendered around a patch as context for the image network"
     )
     background_share: Annotated[float, Field(ge=0, le=1)] = Field(
-        0.15, description="share of patches placed anywhere in an image rather than on an actor"
+        default=0.15, description="share of patches placed anywhere in an image rather than on an actor"
     )
     lidar_rays: Annotated[int, Field(ge=0)] = 256
     lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.05, description="share of the largest LiDAR residuals left out of a batch"
+        default=0.05, description="share of the largest LiDAR residuals left out of a batch"
     )
     smallest_actor: PositiveInt = Field(
-        8,
+        default=8,
         description="pixels, in the rendered image, that the longer side of an actor's box must have to be learned",
     )
     checkpoint_every: PositiveInt = 200
