@@ -1,0 +1,415 @@
+"""Reconstruction on a tiny log: training that resumes exactly, its data, its losses, and the library it leaves."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+import yaml
+from numpy.typing import NDArray
+from tiny_log import CAR_SIZE, MOVING, PARKED, WALKER, build_tiny_log
+
+from genassets.driving import Log, open_log
+from genassets.errors import StageError
+from genassets.geometry.cameras import Intrinsics, project
+from genassets.geometry.transforms import invert_pose, transform_directions
+from genassets.geometry.turntable import turntable_camera
+from genassets.reconstruction import training
+from genassets.reconstruction.library import load_library, make_library, save_library
+from genassets.reconstruction.losses import kl_loss, lidar_loss
+from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.scene import rendered_intrinsics
+from genassets.reconstruction.scene_renderer import SceneRenderer
+from genassets.reconstruction.settings import ModelSettings, ReconstructionSettings, RenderingSettings
+from genassets.reconstruction.training import Trainer, build_model, train
+from genassets.reconstruction.training_data import TrainingLog, draw_batch, prepare_training
+
+PAPER_PROFILE = Path(__file__).parents[1] / "data_specs" / "profiles" / "paper.yaml"
+CAMERAS = ("front_camera", "front_left_camera")
+SETTINGS = ReconstructionSettings(
+    image_scale=1.0,
+    steps=6,
+    patches=2,
+    patch_size=8,
+    background_share=0.0,
+    lidar_rays=32,
+    smallest_actor=4,
+    checkpoint_every=2,
+    model=ModelSettings(
+        latent_size=4,
+        latent_channels=4,
+        decoder_channels=(8, 8),
+        plane_channels=4,
+        field_hidden=8,
+        features=4,
+        background_resolution=16,
+        background_plane_channels=2,
+        background_hidden=8,
+        background_radius=10.0,
+        background_height=5.0,
+        rgb_channels=4,
+        rgb_blocks=2,
+        coarse_resolution=8,
+    ),
+    rendering=RenderingSettings(
+        actor_step=0.2, background_step=4.0, background_far=20.0, sky_samples=2, occupancy_cell=2.0
+    ),
+)
+STRIDE = 2
+LEARNING_STEPS = 60
+
+
+class Killed(Exception):
+    """What stops a training in the midst of it."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    assets: pd.DataFrame
+    data: list[TrainingLog]
+
+    def model(self, seed: int = 0) -> AssetModel:
+        return build_model(self.assets, ["tiny"], SETTINGS, seed)
+
+    def trainer(self, settings: ReconstructionSettings = SETTINGS) -> Trainer:
+        return Trainer(self.model(), self.data, settings, seed=0)
+
+    def train(
+        self, work_dir: Path, seed: int = 0, curve: Callable[[str, int, float], None] = lambda *_: None
+    ) -> AssetModel:
+        work_dir.mkdir(exist_ok=True)
+        model = self.model(seed)
+        train(model, self.data, SETTINGS, seed, work_dir, lambda *_: None, curve)
+        return model
+
+
+def even(frame: int) -> bool:
+    return frame % 2 == 0
+
+
+def changed(settings: ReconstructionSettings, **values: object) -> ReconstructionSettings:
+    return settings.model_copy(update=values)
+
+
+def same_state(a: AssetModel, b: AssetModel) -> bool:
+    ours, theirs = a.state_dict(), b.state_dict()
+    return ours.keys() == theirs.keys() and all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def rgb_error(trainer: Trainer) -> float:
+    """Mean image loss on the same batches whenever it is asked."""
+    batches = [
+        draw_batch(trainer.data[0], SETTINGS, STRIDE, np.random.default_rng(number)) for number in range(6)
+    ]
+    with torch.no_grad():
+        return float(np.mean([trainer.losses(0, batch, None).losses["rgb"].item() for batch in batches]))
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    return open_log(build_tiny_log(tmp_path_factory.mktemp("logs") / "tiny", frames=4, cameras=CAMERAS))
+
+
+@pytest.fixture(scope="module")
+def prepared(log: Log) -> Prepared:
+    return Prepared(*prepare_training([log], CAMERAS, even, SETTINGS, STRIDE))
+
+
+@pytest.fixture(scope="module")
+def undisturbed(prepared: Prepared, tmp_path_factory: pytest.TempPathFactory) -> AssetModel:
+    return prepared.train(tmp_path_factory.mktemp("undisturbed"))
+
+
+@pytest.fixture(scope="module")
+def learned(prepared: Prepared) -> tuple[Trainer, float]:
+    """A trainer after LEARNING_STEPS, and its image loss before the first."""
+    trainer = prepared.trainer(changed(SETTINGS, steps=LEARNING_STEPS))
+    before = rgb_error(trainer)
+    for _ in range(LEARNING_STEPS):
+        trainer.advance()
+    trainer.refresh_coarse_distance()
+    return trainer, before
+
+
+@pytest.fixture(scope="module")
+def library(
+    learned: tuple[Trainer, float], prepared: Prepared, tmp_path_factory: pytest.TempPathFactory
+) -> Path:
+    data = prepared.data
+    directory = tmp_path_factory.mktemp("library")
+    made = make_library(
+        prepared.assets, learned[0].model, SETTINGS, [d.scene for d in data], [d.occupancy for d in data]
+    )
+    save_library(made, directory)
+    return directory
+
+
+@pytest.fixture(scope="module")
+def renderer(library: Path) -> SceneRenderer:
+    return SceneRenderer.load(library)
+
+
+def test_a_killed_and_resumed_training_equals_an_undisturbed_one(
+    prepared: Prepared, undisturbed: AssetModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "CURVE_EVERY", 1)
+    steps = []
+
+    def kill(name: str, step: int, value: float) -> None:
+        steps.append(step)
+        if step == 5 and min(steps) == 1:
+            raise Killed
+
+    with pytest.raises(Killed):
+        prepared.train(tmp_path, curve=kill)
+    steps.clear()
+    resumed = prepared.train(tmp_path, curve=kill)
+    assert min(steps) == 5  # from the checkpoint of step 4, not from the start
+    assert same_state(resumed, undisturbed)
+
+
+def test_the_seed_alone_decides_the_numbers(
+    prepared: Prepared, undisturbed: AssetModel, tmp_path: Path
+) -> None:
+    torch.manual_seed(99)  # nothing may come from the global generator
+    assert same_state(prepared.train(tmp_path / "again"), undisturbed)
+    assert not same_state(prepared.train(tmp_path / "other", seed=1), undisturbed)
+
+
+def test_the_image_loss_falls(learned: tuple[Trainer, float]) -> None:
+    trainer, before = learned
+    assert rgb_error(trainer) < 0.7 * before
+
+
+def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(
+    prepared: Prepared, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "CURVE_EVERY", 1)
+    model = prepared.model()
+
+    def poison(name: str, step: int, value: float) -> None:
+        if step == 3:
+            model.rgb.image.bias.data.fill_(math.nan)
+
+    with pytest.raises(StageError, match=r"'rgb' is nan at step 3 \(log tiny, actors \[\d") as caught:
+        train(model, prepared.data, SETTINGS, 0, tmp_path, lambda *_: None, poison)
+    assert "checkpoint" in str(caught.value)
+    kept = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    assert kept["step"] == 2
+    assert all(value.isfinite().all() for value in kept["model"].values())
+
+
+def test_a_step_learns_from_the_decoded_actors_alone(prepared: Prepared) -> None:
+    """Bystanders keep their planes; codes of actors that are not learned stay, whatever momentum they had."""
+    trainer = prepared.trainer(changed(SETTINGS, decoded_actors=1, patches=4))
+    model = trainer.model
+    embeddings = (model.latent_mean, model.latent_log_variance)
+    everyone = set(range(len(prepared.assets)))
+    learned = set()
+    for _ in range(6):
+        planes = trainer.planes.clone()
+        codes = [embedding.weight.detach().clone() for embedding in embeddings]
+        actors = trainer.advance().actors.tolist()
+        assert len(actors) == 1
+        learned |= set(actors)
+        others = sorted(everyone - set(actors))
+        for embedding, before in zip(embeddings, codes, strict=True):
+            gradient = embedding.weight.grad
+            assert gradient is not None
+            assert gradient.coalesce().indices()[0].tolist() == actors
+            assert torch.equal(embedding.weight.detach()[others], before[others])
+            assert not torch.equal(embedding.weight.detach()[actors], before[actors])
+        assert torch.equal(trainer.planes[others], planes[others])
+        assert not torch.equal(trainer.planes[actors], planes[actors])
+    assert len(learned) > 1  # otherwise momentum was never tried
+
+
+def test_a_log_without_actors_is_refused(tmp_path: Path) -> None:
+    empty = open_log(build_tiny_log(tmp_path / "empty", frames=2, cameras=CAMERAS[:1], actors=False))
+    with pytest.raises(StageError, match=r"\(empty\) shows an actor of at least 4 pixels"):
+        prepare_training([empty], CAMERAS[:1], even, SETTINGS, STRIDE)
+
+
+def test_actors_that_are_seen_too_small_are_not_learned(log: Log, prepared: Prepared) -> None:
+    """The front camera shows the moving car 26 and 24 pixels long, the parked one 20 and 23."""
+    assert set(prepared.assets["actor_id"]) == {PARKED, MOVING, WALKER}
+    front = CAMERAS[:1]
+    table, data = prepare_training([log], front, even, changed(SETTINGS, smallest_actor=25), STRIDE)
+    assert table["actor_id"].tolist() == [MOVING]
+    assert table["observations"].tolist() == [len(data[0].observations)] == [1]
+    assert table[["size_l", "size_w", "size_h"]].to_numpy().tolist() == [list(CAR_SIZE)]
+    with pytest.raises(StageError, match="at least 40 pixels"):
+        prepare_training([log], front, even, changed(SETTINGS, smallest_actor=40), STRIDE)
+
+
+def test_only_training_frames_are_read(prepared: Prepared) -> None:
+    views = [(view.camera, view.frame) for view in prepared.data[0].views]
+    assert views == [(camera, frame) for camera in CAMERAS for frame in (0, 2)]
+    assert [sweep.frame for sweep in prepared.data[0].lidar] == [0, 2]
+
+
+def test_a_log_without_lidar_trains_on_images_alone(tmp_path: Path) -> None:
+    dark = open_log(build_tiny_log(tmp_path / "tiny", frames=2, cameras=CAMERAS[:1], sweeps=False))
+    assets, data = prepare_training([dark], CAMERAS[:1], even, SETTINGS, STRIDE)
+    trainer = Prepared(assets, data).trainer()
+    assert trainer.advance().losses.keys() == {"rgb", "kl"}
+    assert not data[0].occupancy.cells.any()
+
+
+def test_a_patch_over_an_actor_contains_it(prepared: Prepared) -> None:
+    """To half a feature pixel, the rounding of its corner."""
+    data = prepared.data[0]
+    seen = next(o for o in data.observations if prepared.assets["actor_id"][o.actor] == MOVING)
+    view = data.views[seen.view]
+    alone = replace(
+        data, views=[view], images=[data.images[seen.view]], observations=[replace(seen, view=0)], lidar=[]
+    )
+    size = 16
+    settings = changed(SETTINGS, patches=1, patch_size=size, patch_margin=0)
+    corners = set()
+    for number in range(12):
+        batch = draw_batch(alone, settings, STRIDE, np.random.default_rng(number))
+        x0, y0, x1, y1 = patch_bounds(batch.rays.direction.numpy(), view.scene_from_camera, view.intrinsics)
+        corners.add((x0, y0))
+        assert x1 - x0 == y1 - y0 == size * STRIDE
+        left, top, right, bottom = seen.bounds
+        half = STRIDE / 2
+        assert x0 - half <= left and right <= x1 + half
+        assert y0 - half <= top and bottom <= y1 + half
+        image = alone.images[0][y0:y1, x0:x1].permute(2, 0, 1).float() / 255
+        assert torch.equal(batch.pixels[0], image)
+    assert len(corners) > 1
+
+
+def patch_bounds(
+    directions: NDArray, scene_from_camera: NDArray, intrinsics: Intrinsics
+) -> tuple[int, int, int, int]:
+    """Pixels x0, y0, x1, y1 that a patch's rays cover, from its first and last ray."""
+    ends = transform_directions(invert_pose(scene_from_camera), directions[[0, -1]].astype(np.float64))
+    first, last = project(intrinsics, ends)
+    return tuple(int(v) for v in np.round([*(first - STRIDE / 2), *(last + STRIDE / 2)]))  # type: ignore[return-value]
+
+
+def test_a_patch_larger_than_the_feature_map_is_refused(prepared: Prepared) -> None:
+    with pytest.raises(StageError, match="patch_size 28 exceeds the feature map of front_.*camera"):
+        draw_batch(
+            prepared.data[0], changed(SETTINGS, patch_size=28), STRIDE, np.random.default_rng(0)
+        )  # 48 x 27
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 0.25, 0.1, 0.001])
+def test_rendered_images_are_multiples_of_the_stride_and_keep_the_field_of_view(scale: float) -> None:
+    stored = Intrinsics(1970.0, 1970.0, 970.0, 483.0, 1920, 1080)
+    rendered = rendered_intrinsics(stored, scale, 4)
+    assert rendered.width % 4 == rendered.height % 4 == 0
+    assert abs(rendered.width - 1920 * scale) <= 4 and abs(rendered.height - 1080 * scale) <= 4
+    assert rendered.fx / rendered.width == pytest.approx(1970 / 1920)
+    assert rendered.cy / rendered.height == pytest.approx(483 / 1080)
+
+
+def test_kl_in_closed_form() -> None:
+    zero = torch.zeros(2, 3, 4, 4)
+    assert kl_loss(zero, zero).item() == 0
+    assert kl_loss(zero + 2, zero).item() == pytest.approx(2.0)  # mu^2 / 2
+    assert kl_loss(zero, zero + 1).item() == pytest.approx((math.e - 2) / 2)
+    assert kl_loss(zero, zero - 30).item() == pytest.approx(14.5)
+    assert kl_loss(zero, zero + 30).item() == pytest.approx((math.exp(30) - 31) / 2)
+
+
+def test_lidar_loss_leaves_out_the_worst_twentieth() -> None:
+    observed = torch.full((20,), 5.0)
+    rendered = observed + torch.tensor([*range(1, 20), 1000.0])
+    assert lidar_loss(rendered, observed, 0.05).item() == pytest.approx(10.0)
+    assert lidar_loss(rendered, observed, 0.0).item() == pytest.approx(59.5)
+    assert lidar_loss(rendered[:0], observed[:0], 0.05).item() == 0
+
+
+def test_a_library_comes_back_as_it_was(
+    library: Path, renderer: SceneRenderer, prepared: Prepared, log: Log, tmp_path: Path
+) -> None:
+    pd.testing.assert_frame_equal(renderer.assets, prepared.assets, check_dtype=False)
+    before = renderer.render_image(log, "front_camera", 1)
+    save_library(load_library(library), tmp_path / "copy")
+    np.testing.assert_array_equal(
+        SceneRenderer.load(tmp_path / "copy").render_image(log, "front_camera", 1), before
+    )
+    with pytest.raises(KeyError, match="nobody"):
+        renderer.library.index_of("tiny", "nobody")
+
+
+def test_what_is_no_library_is_refused(library: Path, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"config\.json is missing"):
+        load_library(tmp_path)
+    config = json.loads((library / "config.json").read_text(encoding="utf-8"))
+    config["format_version"] = 99
+    (tmp_path / "config.json").write_text(json.dumps(config), encoding="utf-8")
+    with pytest.raises(StageError, match="format_version is 99, this release reads 1"):
+        load_library(tmp_path)
+
+
+def test_a_region_is_rendered_as_in_the_whole_frame(renderer: SceneRenderer, log: Log) -> None:
+    whole = renderer.render_image(log, "front_camera", 1)
+    intrinsics = renderer.render_intrinsics(log, "front_camera")
+    assert whole.shape == (intrinsics.height, intrinsics.width, 3) == (54, 96, 3)
+    assert whole.dtype == np.float32
+    assert whole.min() >= 0 and whole.max() <= 1
+    part = renderer.render_image(log, "front_camera", 1, (9, 21, 40, 46))
+    assert part.shape == (25, 31, 3)
+    np.testing.assert_allclose(part, whole[21:46, 9:40], atol=2e-3)
+
+
+def test_an_actor_alone_fills_its_middle_and_nothing_else(renderer: SceneRenderer) -> None:
+    intrinsics, box_from_camera = turntable_camera(CAR_SIZE, 90.0, resolution=64)
+    view = renderer.render_actor("tiny", PARKED, intrinsics, box_from_camera)
+    assert view.rgb.shape == (64, 64, 3) and view.alpha.shape == view.depth.shape == (64, 64)
+    assert view.alpha[:8].max() < 0.01 and view.alpha[-8:].max() < 0.01
+    assert view.alpha[32, 32] > 0.95
+    assert view.rgb.min() >= 0 and view.rgb.max() <= 1
+    assert view.rgb[:8].max() < 0.01
+    distance = float(np.linalg.norm(box_from_camera[:3, 3]))
+    assert distance - CAR_SIZE[0] / 2 < view.depth[32, 32] < distance
+
+
+@pytest.mark.parametrize("actor", [PARKED, MOVING, WALKER])
+def test_the_surface_of_an_actor_closes_inside_its_label(renderer: SceneRenderer, actor: str) -> None:
+    resolution = 33
+    grid, first, spacing = renderer.actor_sdf("tiny", actor, resolution)
+    assert grid.shape == (resolution,) * 3
+    row = renderer.assets.set_index("actor_id").loc[actor]
+    half = row[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64) / 2
+    axes = [np.abs(f + s * np.arange(resolution)) >= h for f, s, h in zip(first, spacing, half, strict=True)]
+    beyond = axes[0][:, None, None] | axes[1][None, :, None] | axes[2][None, None, :]
+    assert all(axis[0] and axis[-1] and not axis[16] for axis in axes)
+    assert grid[beyond].min() > -1e-6  # a value may lie on the face itself, to float32's rounding
+    assert grid[16, 16, 16] < 0
+
+
+def test_the_paper_profile_is_the_papers_model() -> None:
+    """Supplement, "Scene Representation Model" to "Training Details"."""
+    document = yaml.safe_load(PAPER_PROFILE.read_text(encoding="utf-8"))
+    settings = ReconstructionSettings.model_validate(document["reconstruct"])
+    car = pd.DataFrame({"actor_class": ["Car"], "size_l": [4.5], "size_w": [1.9], "size_h": [1.6]})
+    model = build_model(car, ["log"], settings, seed=0)
+    assert model.latent_shape == (32, 8, 8)
+    assert model.class_embedding.shape == (8, 32, 8, 8)
+    assert model.stride == 4
+    with torch.no_grad():
+        index = torch.tensor([0])
+        assert model.decode(index, model.latents(index).code).shape == (1, 3, 12, 128, 128)
+        assert model.rgb(torch.zeros(1, 32, 4, 4)).shape == (1, 3, 16, 16)
+    assert model.backgrounds[0].planes.shape == (1, 3, 12, 256, 256)
+    assert len(model.rgb.blocks) == 6
+    assert {tuple(c.weight.shape) for b in model.rgb.blocks for c in (b.conv1, b.conv2)} == {(32, 32, 5, 5)}
+    rates, weights, rendering = settings.rates, settings.weights, settings.rendering
+    assert (rates.latent, rates.decoder, rates.field, rates.rgb) == (0.05, 1e-4, 1e-3, 1e-3)
+    assert (weights.rgb, weights.lidar, weights.kl) == (1.0, 0.01, 1e-5)
+    assert (rendering.actor_step, rendering.background_step, rendering.sky_samples) == (0.05, 0.30, 8)
+    assert rendering.occupancy_cell == 0.5
+    assert settings.image_scale == 1.0
