@@ -32,7 +32,8 @@ from genassets.driving import (
     count_actor_points,
     open_log,
 )
-from genassets.driving.cuboids import SPIN_AXIS_FORWARD, Cuboid, join_tracks, read_cuboids, spin_offset
+from genassets.driving.cuboids import Cuboid, join_tracks, read_cuboids, spin_offset
+from genassets.driving.sweep import SPINNING_POSITION
 from genassets.geometry.boxes import points_in_box
 from genassets.geometry.transforms import heading_of, transform_points, yaw_pose
 
@@ -110,7 +111,7 @@ def test_a_moving_actor_goes_on_a_little_beyond_its_track_and_a_parked_one_stays
 def test_the_spinning_lidar_looks_back_at_its_stamp_and_forward_half_a_turn_before() -> None:
     """x right, y forward, clockwise from above: left 75 ms, forward 50 ms, right 25 ms before the stamp."""
     lidar = np.eye(4)
-    axis = SPIN_AXIS_FORWARD
+    axis = SPINNING_POSITION[0]
     for point, milliseconds in (
         ((0.0, 9.0, 0.0), -50),
         ((-9.0, axis, 0.0), -75),
