@@ -1,4 +1,4 @@
-"""Turn driving logs into complete 3D actors, a generative prior over them, and augmented training sets."""
+"""Turn driving logs into complete 3D actors, evaluated on held-out views."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ It lies outside genassets.driving, so that reading a spec imports no numpy.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -20,16 +20,8 @@ ActorClass = Literal[
     "Pedestrian",
 ]
 
-ALL_CLASSES: tuple[ActorClass, ...] = (
-    "Car",
-    "Truck",
-    "Bus",
-    "Construction Vehicle",
-    "Emergency Vehicle",
-    "Bicycle",
-    "Motorcycle",
-    "Pedestrian",
-)
+ALL_CLASSES: tuple[ActorClass, ...] = get_args(ActorClass)
+"""The paper's eight, in its order."""
 
 
 class CitySpec(BaseModel):

@@ -40,9 +40,9 @@ def triplane(planes: Tensor, x: Tensor) -> Tensor:
 
 
 def actor_distance(x: Tensor, size: Tensor, residual: float) -> float:
-    """A rounded box of 0.9 of the actor's size, plus the bent residual, never outside the labelled box."""
-    half = size / 2 * 0.9
-    radius = 0.6 * float(half.min())
+    """A rounded box of 0.85 of the actor's size, plus the bent residual, never outside the labelled box."""
+    half = size / 2 * 0.85
+    radius = 0.9 * float(half.min())
     q = x.abs() - (half - radius)
     prior = float(q.clamp(min=0).norm()) + min(float(q.max()), 0.0) - radius
     reach = float(size[2]) / 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,13 +11,20 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from genassets.curation.object_table import OBJECT_SCHEMA, write_object_table
 from genassets.driving.log import CameraStream, Log
+from genassets.errors import StageError
 from genassets.evaluation.pictures import PictureRow, picture_sheet, side_by_side
-from genassets.evaluation.sparse_view import Comparison, Observation, Scored, Skipped, evaluate_log
+from genassets.evaluation.sparse_view import Comparison, Observation, Scored, Skipped, View, evaluate_log
 from genassets.evaluation.sparse_view_pictures import HEADINGS, picture_row, representative_observations
 from genassets.evaluation.sparse_view_tables import actor_table, means, observation_table, view_table
 from genassets.evaluation.viewpoint import Viewpoint
 from genassets.geometry.cameras import Intrinsics
+from genassets.geometry.transforms import make_pose
+from genassets.reconstruction.scene_renderer import SceneRenderer
+from genassets.specs.split import Split
+from genassets.stages.evaluate_reconstruction import EvaluateReconstructionConfig, _seen, run
+from genassets.stages.stage import Inputs, StageContext
 
 WIDTH, HEIGHT, FRAMES = 128, 64, 4
 BOX = (32.0, 16.0, 80.0, 48.0)
@@ -89,7 +97,7 @@ def observed(
 ) -> Observation:
     mask = speck if small else box_mask
     return Observation(
-        "made", frame, "front_camera", actor, kind, BOX, mask, "truth", Viewpoint(position)
+        "made", frame, "front_camera", actor, kind, Viewpoint(position), BOX, mask, "truth"
     )  # fmt: skip
 
 
@@ -108,7 +116,7 @@ def score(
 ) -> tuple[list[Scored], list[Skipped]]:
     renderer = HalfSizeRenderer(error)
     return evaluate_log(
-        log, training, held_out, library, renderer, None, Comparison(), lambda done, total: None
+        log, training, training, held_out, library, renderer, None, Comparison(), lambda done, total: None
     )
 
 
@@ -116,6 +124,7 @@ def score(
 def table(log: Log) -> pd.DataFrame:
     scored, skipped = evaluate_log(
         log,
+        TRAINING,
         TRAINING,
         HELD_OUT,
         frozenset({"a", "unseen"}),
@@ -178,6 +187,73 @@ def test_gain_over_a_worse_baseline_is_positive(log: Log) -> None:
     )  # the only crop is 0.2 off, the model 0.02
 
 
+def test_views_without_a_mask_decide_the_group_but_are_no_crops(log: Log) -> None:
+    side = View("made", 2, "left_camera", "a", "Car", Viewpoint((13.0, 0.0, 0.0)))
+    hidden = View("made", 2, "left_camera", "bare", "Car", Viewpoint((0.0, 9.0, 0.0)))
+    held_out = [HELD_OUT[1], observed(3, (9.0, 0.0, 0.0), actor="bare")]
+    scored, _ = evaluate_log(
+        log, [*TRAINING, side, hidden], TRAINING, held_out, frozenset({"a", "bare"}), HalfSizeRenderer(0.1),
+        None, Comparison(), lambda done, total: None,
+    )  # fmt: skip
+    seen = {item.observation.actor_id: item for item in scored}
+    # 1 m from the nearest masked view, which is the crop; none from the unmasked one, which decides.
+    assert seen["a"].group == "same" and seen["a"].nearest == side and seen["a"].source == TRAINING[1]
+    assert seen["bare"].group == "no_crop" and set(seen["bare"].predictions) == {"model"}
+    assert seen["bare"].difference is not None and seen["bare"].difference.angle_degrees == 90.0
+    table = observation_table(scored).to_pandas()
+    assert table.loc[table["actor_id"] == "a", "crop_frame"].tolist() == [2, 2, 2]
+    psnr = {(m.setting, m.method.split(";")[0]): m for m in means(table) if m.metric == "psnr"}
+    # The compared means hold the same observations for every predictor.
+    assert {psnr["sparse_view/all", name].n for name in ("model", "mean_colour", "nearest_crop")} == {1}
+    assert "no baselines" in psnr["sparse_view/no_crop", "model"].method
+    assert len(representative_observations(scored)) == 1
+
+
+def table_row(**values: Any) -> dict[str, Any]:
+    """A visible, unmasked row of a 1920 x 1080 image, whose box has 20 x 10 pixels."""
+    row: dict[str, Any] = dict.fromkeys(OBJECT_SCHEMA.names)
+    row |= {"log": "made", "frame": 0, "camera": "left_camera", "actor_id": "a", "actor_class": "Car"}
+    row |= {"time_of_day": "day", "stationary": True, "size_l": 4.0, "size_w": 2.0, "size_h": 1.5}
+    row |= {"box_from_camera": make_pose(np.eye(3), (0.0, 9.0, 0.0)).ravel().tolist()}
+    row |= {"x0": 0.0, "y0": 0.0, "x1": 20.0, "y1": 10.0, "hull": [], "depth": 9.0, "nearest_depth": 8.0}
+    row |= {"truncation": 0.0, "mask_height": 1080, "mask_width": 1920, "occluded": 0.0}
+    return row | {"kept": False, "reason": "not_requested"} | values
+
+
+def test_training_views_are_the_visible_boxes_of_every_training_camera(tmp_path: Path) -> None:
+    kept = {"kept": True, "reason": None, "segmenter": "truth", "mask_rle": [0, 1920 * 1080]}
+    rows = [
+        table_row(actor_id="unmasked"),
+        table_row(actor_id="half covered", occluded=0.5),
+        table_row(actor_id="covered", occluded=0.51),
+        table_row(actor_id="small", x1=9.9),
+        table_row(actor_id="small, small image", x1=9.9, mask_width=960, mask_height=540),
+        table_row(actor_id="other camera", camera="right_camera"),
+        table_row(actor_id="held out, unmasked", frame=1, camera="front_camera"),
+        table_row(actor_id="masked", camera="front_camera", occluded=0.9, **kept),
+        table_row(actor_id="held out", frame=1, camera="front_camera", **kept),
+        table_row(actor_id="held out, other camera", frame=1, **kept),
+    ]
+    write_object_table(tmp_path / "objects.parquet", rows)
+    config = EvaluateReconstructionConfig(split=Split(train_cameras=("front_camera", "left_camera")))
+    seen = _seen(tmp_path, config)
+    names = ["unmasked", "half covered", "small, small image", "masked"]
+    assert [view.actor_id for view in seen.views] == names
+    assert seen.views[0].viewpoint.azimuth == pytest.approx(90.0)
+    assert [o.actor_id for o in seen.training] == ["masked"]
+    assert [o.actor_id for o in seen.held_out] == ["held out"]
+
+
+def test_without_training_masks_nothing_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    held_out = {"frame": 1, "camera": "front_camera", "kept": True, "reason": None, "segmenter": "truth"}
+    write_object_table(tmp_path / "objects.parquet", [table_row(), table_row(**held_out)])
+    monkeypatch.setattr(SceneRenderer, "load", lambda path: HalfSizeRenderer(0.0))
+    # No log.json lies there: opening the log would fail otherwise.
+    inputs = Inputs({name: {"made": tmp_path} for name in ("ingest", "filter_occlusion", "reconstruct")})
+    with pytest.raises(StageError, match="no observation of a training frame"):
+        run(inputs, EvaluateReconstructionConfig(lpips=False), tmp_path, StageContext(0, "made", tmp_path))
+
+
 def test_means_of_nothing_are_none() -> None:
     assert means(observation_table([]).to_pandas()) == []
 
@@ -201,6 +277,7 @@ def test_pictures_show_one_view_an_actor_best_first(log: Log) -> None:
     held_out = [*HELD_OUT[:2], observed(2, (10.0, 0.0, 0.0), actor="dark")]
     scored, _ = evaluate_log(
         log,
+        training,
         training,
         held_out,
         frozenset({"a", "dark"}),

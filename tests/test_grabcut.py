@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from box_prompt import box_prompt
 from numpy.typing import NDArray
 
 from genassets.masks.agreement import mask_iou
@@ -20,7 +21,7 @@ def drawn_disc(radius: float = 30.0) -> tuple[NDArray[np.uint8], NDArray[np.bool
     rows, columns = np.mgrid[:120, :160] + 0.5
     disc = (columns - 70) ** 2 + (rows - 60) ** 2 < radius**2
     image[disc] = generator.integers(0, 30, (int(disc.sum()), 3)) + [200, 20, 20]
-    return image, disc, Prompt.of_box(70 - radius, 60 - radius, 70 + radius, 60 + radius)
+    return image, disc, box_prompt(70 - radius, 60 - radius, 70 + radius, 60 + radius)
 
 
 @pytest.mark.parametrize("radius", [8.0, 30.0, 55.0])
@@ -50,9 +51,7 @@ def test_same_input_gives_the_same_mask() -> None:
 
 def test_box_over_the_whole_image_and_box_below_a_pixel() -> None:
     image, _, _ = drawn_disc()
-    masks = GrabCutSegmenter().segment(
-        image, [Prompt.of_box(0, 0, 160, 120), Prompt.of_box(5.2, 5.2, 5.6, 5.6)]
-    )
+    masks = GrabCutSegmenter().segment(image, [box_prompt(0, 0, 160, 120), box_prompt(5.2, 5.2, 5.6, 5.6)])
     assert [mask.shape for mask in masks] == [(120, 160)] * 2
 
 

@@ -138,10 +138,8 @@ def test_an_old_pandas_opens_what_was_written(tmp_path: Path) -> None:
 def test_semseg_is_written_beside_its_sweep(tmp_path: Path) -> None:
     with writer(tmp_path / "900") as out:
         out.add_semseg(0, np.array([13, 7, 13]))
-        out.add_semseg_names({13: "Car", 7: "Road"})
     folder = tmp_path / "900/annotations/semseg"
     assert pandas.read_pickle(folder / "00.pkl.gz")["class"].tolist() == [13, 7, 13]
-    assert json.loads((folder / "classes.json").read_text()) == {"7": "Road", "13": "Car"}
 
 
 def test_an_exception_leaves_nothing(tmp_path: Path) -> None:

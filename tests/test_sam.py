@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from box_prompt import box_prompt
 from numpy.typing import NDArray
 
 from genassets import weights
@@ -38,7 +39,7 @@ def drawn_discs() -> tuple[NDArray[np.uint8], list[NDArray[np.bool_]], list[Prom
         disc = (columns - x) ** 2 + (rows - y) ** 2 < radius**2
         image[disc] = generator.integers(0, 255, 3)
         discs.append(disc)
-        prompts.append(Prompt.of_box(x - radius, y - radius, x + radius, y + radius))
+        prompts.append(box_prompt(x - radius, y - radius, x + radius, y + radius))
     return image, discs, prompts
 
 

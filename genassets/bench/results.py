@@ -12,6 +12,9 @@ from typing import Any
 from genassets.errors import SpecError
 from genassets.pipeline.atomic_write import write_text
 
+BEGIN = "<!-- bench:begin -->"
+END = "<!-- bench:end -->"
+
 
 def machine() -> str:
     """The machine in words: processor, cores, memory."""
@@ -39,17 +42,47 @@ def read_results(path: Path) -> dict[str, Any]:
     return values
 
 
+def default_results() -> Path:
+    """docs/benchmarks.json when the current directory is the checkout, else benchmarks.json in it."""
+    checkout = Path(__file__).resolve().parents[2]
+    inside = Path.cwd().resolve() == checkout and (checkout / "docs").is_dir()
+    return Path("docs/benchmarks.json") if inside else Path("benchmarks.json")
+
+
 def write_results(path: Path, results: Mapping[str, Any]) -> Path:
-    """Write the JSON file and, beside it, the same as Markdown; returns the Markdown file."""
+    """Write the JSON file and, beside it, the same as Markdown; returns the Markdown file.
+
+    Of a Markdown file that is there, only what lies between BEGIN and END is replaced. Raises what
+    `around_tables` raises, and writes nothing then.
+    """
+    before, after = around_tables(path)
     write_text(path, json.dumps(results, indent=1) + "\n", durable=False)
     table = path.with_suffix(".md")
-    write_text(table, markdown(results), durable=False)
+    write_text(table, f"{before}{BEGIN}\n{markdown(results)}{END}{after}", durable=False)
     return table
+
+
+def around_tables(path: Path) -> tuple[str, str]:
+    """What the Markdown file beside the JSON file has before BEGIN and after END; a heading where there is none.
+
+    Raises:
+        SpecError: the file has not exactly one BEGIN followed by one END.
+    """
+    table = path.with_suffix(".md")
+    text = table.read_text(encoding="utf-8") if table.is_file() else f"# Benchmarks\n\n{BEGIN}\n{END}\n"
+    before, begun, rest = text.partition(BEGIN)
+    _, ended, after = rest.partition(END)
+    if not begun or not ended or BEGIN in rest or END in before + after:
+        raise SpecError(
+            f"{table}: expected one line {BEGIN} and after it one line {END}, between which the tables go; add "
+            "them, or write elsewhere with --out"
+        )
+    return before, after
 
 
 def markdown(results: Mapping[str, Any]) -> str:
     """One section a benchmark: summary, date, machine, command, table."""
-    parts = ["# Benchmarks", "", "Written by `genassets bench`; edit nothing here.", ""]
+    parts = ["Written by `genassets bench`; edit nothing up to the end marker.", ""]
     for name, entry in results.items():
         parts += [f"## {name}", "", entry["summary"] + ".", ""]
         parts += [
@@ -58,7 +91,7 @@ def markdown(results: Mapping[str, Any]) -> str:
             *_table(entry["rows"]),
             "",
         ]
-    return "\n".join(parts)
+    return "\n".join(parts) + "\n"
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -31,7 +31,7 @@ from genassets.errors import EnvironmentProblem, GenAssetsError
 
 app = typer.Typer(
     name="genassets",
-    help="Driving logs to complete 3D actors, a generative prior over them, and augmented training sets.",
+    help="Driving logs to complete 3D actors, evaluated on held-out views.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

@@ -12,20 +12,27 @@ import typer
 
 def bench(
     names: Annotated[list[str] | None, typer.Argument(help="Benchmarks; all by default.")] = None,
-    out: Annotated[Path, typer.Option("--out", help="JSON file; the Markdown table goes beside it.")] = Path(
-        "docs/benchmarks.json"
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="JSON file; the Markdown table goes beside it, between its bench markers. By default "
+            "docs/benchmarks.json in the checkout, ./benchmarks.json elsewhere.",
+        ),
+    ] = None,
 ) -> None:
     """Measure, and keep the results of the benchmarks that were not asked for."""
     from genassets.bench.benchmark import benchmarks
-    from genassets.bench.results import machine, read_results, write_results
+    from genassets.bench.results import around_tables, default_results, machine, read_results, write_results
     from genassets.errors import SpecError
 
     known = {benchmark.name: benchmark for benchmark in benchmarks()}
     unknown = [name for name in names or () if name not in known]
     if unknown:
         raise SpecError(f"benchmark {unknown[0]!r}: unknown; there are {', '.join(known)}")
-    results = read_results(out)
+    path = out or default_results()
+    results = read_results(path)
+    around_tables(path)  # a file without its markers is refused before minutes of measuring
     for name in names or known:
         rows = known[name].run(partial(_say, name))
         results[name] = {
@@ -35,7 +42,7 @@ def bench(
             "command": f"genassets bench {name}",
             "rows": [dict(row) for row in rows],
         }
-        table = write_results(out, results)
+        table = write_results(path, results)
         typer.echo(f"{name}: {len(rows)} rows -> {table}", err=True)
 
 

@@ -35,10 +35,9 @@ class AcceptanceRules:
     reject_untested: drop rows whose LiDAR test cannot be made (reason "no_lidar"); else they pass it.
     min_mask_px: mask pixels in a 1920 x 1080 image. DiscoScene's variant is 200.
     scale_with_image: count min_mask_px in proportion to the stored image's area, so that the same actor
-    passes at
-        any resolution; off: count stored pixels.
+        passes at any resolution; off: count stored pixels.
     occlusion: "union" is the paper's covered fraction of the box; "iou" is DiscoScene's IoU with one nearer
-    box.
+        box.
     outline: the shape that stands for a box under "union": its convex hull, or its bounding rectangle.
     max_occluded: the largest covered fraction, or IoU.
     """

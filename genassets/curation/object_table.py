@@ -29,7 +29,6 @@ NO_MASK = "no_mask"  # the segmenter found nothing
 LIDAR_OUTSIDE = "lidar_outside"  # too many of the actor's returns fall outside the mask
 NO_LIDAR = "no_lidar"  # the LiDAR test cannot be made, and the settings reject that
 OCCLUDED = "occluded"
-REASONS = (NOT_REQUESTED, TRUNCATED, TOO_FAR, TOO_SMALL, NO_MASK, LIDAR_OUTSIDE, NO_LIDAR, OCCLUDED)
 
 
 def _column(name: str, kind: pa.DataType, nullable: bool, about: str) -> pa.Field:

@@ -2,16 +2,9 @@
 
 from __future__ import annotations
 
-CLASSES = (
-    "Car",
-    "Truck",
-    "Bus",
-    "Construction Vehicle",
-    "Emergency Vehicle",
-    "Bicycle",
-    "Motorcycle",
-    "Pedestrian",
-)
+from genassets.city_spec import ALL_CLASSES
+
+CLASSES: tuple[str, ...] = ALL_CLASSES
 VEHICLE_CLASSES = CLASSES[:5]
 
 _CLASS_OF_LABEL = {

@@ -202,12 +202,6 @@ class PandasetWriter:
         table = make_table({"class": np.asarray(classes, dtype=np.int64)}, index_name="index")
         self._write(f"annotations/semseg/{self._frame_name(frame)}.pkl.gz", pickle_table(table))
 
-    def add_semseg_names(self, names: Mapping[int, str]) -> None:
-        """Write annotations/semseg/classes.json, the names of the classes of add_semseg."""
-        self._write_json(
-            "annotations/semseg/classes.json", {str(key): name for key, name in sorted(names.items())}
-        )
-
     def finish(self) -> Path:
         """Put the sequence in its place and return that; a `with` block without error ends with it."""
         try:

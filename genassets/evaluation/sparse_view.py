@@ -4,6 +4,8 @@ An observation is one actor in one image of one frame, with its mask. Three pred
 mask: the reconstruction ("model"), the mean colour of the actor's training pixels ("mean_colour"), and the
 training crop with the nearest viewpoint, resized box bounds to box bounds ("nearest_crop"). Observations fall
 into groups by how far their viewpoint lies from the nearest training viewpoint (`viewpoint.view_group`).
+Training viewpoints need no mask, the baselines do: without any masked training observation an actor is in the
+group "no_crop", where the model stands alone.
 """
 
 from __future__ import annotations
@@ -49,32 +51,39 @@ class ImageRenderer(Protocol):
 
 
 @dataclass(frozen=True)
-class Observation:
-    """One actor in one stored image. `bounds` are its box's, clipped, in stored-image pixels; `mask()`
-    decodes the mask (H, W) of the stored image.
-    """
+class View:
+    """One actor in one stored image, and from where it is seen."""
 
     log: str
     frame: int
     camera: str
     actor_id: str
     actor_class: str
+    viewpoint: Viewpoint
+
+
+@dataclass(frozen=True)
+class Observation(View):
+    """A view with a mask. `bounds` are its box's, clipped, in stored-image pixels; `mask()` decodes the mask
+    (H, W) of the stored image.
+    """
+
     bounds: Bounds
     mask: Callable[[], NDArray[np.bool_]]
     segmenter: str
-    viewpoint: Viewpoint
 
 
 @dataclass(frozen=True)
 class Scored:
     """One held-out observation: where it was compared, its measures per predictor, and the crops for
-    pictures.
+    pictures. `difference` is that to the training view `nearest`, `source` the observation of nearest_crop.
     """
 
     observation: Observation
     group: str
     difference: ViewDifference | None
-    nearest: Observation | None
+    nearest: View | None
+    source: Observation | None
     region: tuple[int, int, int, int]
     mask: NDArray[np.bool_]
     truth: NDArray[np.float32]
@@ -112,6 +121,7 @@ class _TrainingActor:
 
 def evaluate_log(
     log: Log,
+    views: Sequence[View],
     training: Sequence[Observation],
     held_out: Sequence[Observation],
     library: frozenset[str],
@@ -123,6 +133,8 @@ def evaluate_log(
     """Score the held-out observations of one log.
 
     Args:
+        views: from where actors are seen in the training images, with or without a mask.
+        training: the masked observations of training images, which the baselines are made from.
         library: ids of the actors that were reconstructed; observations of others are skipped and returned.
         lpips: the network, or None to leave that measure out.
         on_frame: called with (frames done, frames in all).
@@ -130,6 +142,9 @@ def evaluate_log(
     wanted = {o.actor_id for o in held_out} & library
     by_image = _by_image(held_out)
     known = _training_actors(log, [o for o in training if o.actor_id in wanted], renderer)
+    views_of: dict[str, list[View]] = defaultdict(list)
+    for view in views:
+        views_of[view.actor_id].append(view)
     scored: list[Scored] = []
     skipped: list[Skipped] = []
     for done, ((camera, frame), observations) in enumerate(by_image.items()):
@@ -148,7 +163,8 @@ def evaluate_log(
                 continue
             scored.append(
                 _score(log, observation, region, crop(image, region), mask, scale,
-                       known.get(observation.actor_id), renderer, lpips, comparison)
+                       views_of.get(observation.actor_id, []), known.get(observation.actor_id),
+                       renderer, lpips, comparison)
             )  # fmt: skip
         on_frame(done + 1, len(by_image))
     return scored, skipped
@@ -206,6 +222,7 @@ def _score(
     truth: NDArray[np.float32],
     mask: NDArray[np.bool_],
     scale: ImageScale,
+    views: Sequence[View],
     actor: _TrainingActor | None,
     renderer: ImageRenderer,
     lpips: Lpips | None,
@@ -213,15 +230,23 @@ def _score(
 ) -> Scored:
     rendered = renderer.render_image(log, observation.camera, observation.frame, region)
     predictions = {"model": np.clip(rendered, 0.0, 1.0).astype(np.float32)}
-    difference, nearest = None, None
-    if actor is not None:
+    difference, nearest, source = None, None, None
+    if views:
         index, difference = nearest_view(
+            observation.viewpoint, [view.viewpoint for view in views], comparison.thresholds
+        )
+        nearest = views[index]
+    group = view_group(difference, comparison.thresholds)
+    if actor is None:
+        group = "no_crop" if views else group
+    else:
+        index, _ = nearest_view(
             observation.viewpoint, [o.viewpoint for o in actor.observations], comparison.thresholds
         )
-        nearest = actor.observations[index]
-        pixels, source = actor.crops[index]
+        source = actor.observations[index]
+        pixels, source_bounds = actor.crops[index]
         predictions["mean_colour"] = np.broadcast_to(actor.colour.colour(), truth.shape).copy()
-        placed = place_crop(pixels, source, scale.bounds(observation.bounds), region)
+        placed = place_crop(pixels, source_bounds, scale.bounds(observation.bounds), region)
         predictions["nearest_crop"] = np.clip(placed / np.float32(255.0), 0.0, 1.0)
     measures = {
         name: {
@@ -238,9 +263,10 @@ def _score(
             measures[name]["lpips"] = distance
     return Scored(
         observation=observation,
-        group=view_group(difference, comparison.thresholds),
+        group=group,
         difference=difference,
         nearest=nearest,
+        source=source,
         region=region,
         mask=mask,
         truth=truth,

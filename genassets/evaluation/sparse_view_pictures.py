@@ -18,11 +18,11 @@ def representative_observations(scored: Sequence[Scored]) -> list[Scored]:
     """One observation an actor, best actor first.
 
     Actors are ranked by their mean masked PSNR; each is stood for by the observation whose PSNR is nearest to
-    that mean. Actors without a training observation are left out.
+    that mean. Actors without a masked training observation are left out.
     """
     actors: dict[tuple[str, str], list[Scored]] = defaultdict(list)
     for item in scored:
-        if item.group != "unseen":
+        if item.source is not None:
             actors[item.observation.log, item.observation.actor_id].append(item)
     ranked = []
     for key, items in actors.items():
@@ -33,7 +33,7 @@ def representative_observations(scored: Sequence[Scored]) -> list[Scored]:
 
 
 def picture_row(item: Scored) -> PictureRow:
-    """The panels of `HEADINGS` for one observation with a training view, captioned by its PSNR values."""
+    """The panels of `HEADINGS` for one observation that has baselines, captioned by its PSNR values."""
     seen, model = item.observation, item.predictions["model"]
     values = "  ".join(
         f"{name.replace('_', ' ')} {item.measures[name]['psnr']:.1f} dB" for name in item.predictions

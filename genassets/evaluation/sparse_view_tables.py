@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from genassets.evaluation.image import capped
 from genassets.evaluation.lpips import masked_lpips_method
-from genassets.evaluation.sparse_view import MEASURES, PREDICTORS, Observation, Scored
+from genassets.evaluation.sparse_view import MEASURES, PREDICTORS, Observation, Scored, View
 
 OBSERVATION_SCHEMA = pa.schema(
     [
@@ -21,11 +21,13 @@ OBSERVATION_SCHEMA = pa.schema(
         ("camera", pa.string()),
         ("actor_id", pa.string()),
         ("actor_class", pa.string()),
-        ("group", pa.string()),  # moved, same or unseen
+        ("group", pa.string()),  # moved, same, no_crop or unseen
         ("angle_degrees", pa.float64()),  # to the nearest training viewpoint; null when unseen
         ("distance_metres", pa.float64()),  # change of distance to it
         ("nearest_camera", pa.string()),
         ("nearest_frame", pa.int64()),
+        ("crop_camera", pa.string()),  # of nearest_crop: the nearest training view that has a mask
+        ("crop_frame", pa.int64()),
         ("azimuth", pa.float64()),  # of the camera about the actor, degrees, 0 in front, 90 on its left
         ("range", pa.float64()),  # metres from camera to box centre
         ("mask_px", pa.int64()),  # at the compared size
@@ -50,6 +52,12 @@ VIEW_SCHEMA = pa.schema(
 
 GAIN_MEASURES = ("psnr", "ssim", "lpips")
 """Measures whose differences to the baselines are stated; that of `psnr_on_black` would repeat that of `psnr`."""
+
+MODEL_ALONE = {
+    "no_crop": "; no baselines: no masked training observation",
+    "unseen": "; no baselines: no training view",
+}
+"""Groups in which there is nothing to compare the model with, and how a row's method says so."""
 
 METHOD_OF_MEASURE = {
     "psnr": "masked pixels, capped at 100 dB",
@@ -90,6 +98,8 @@ def observation_table(scored: Iterable[Scored]) -> pa.Table:
                     "distance_metres": item.difference.distance_metres if item.difference else None,
                     "nearest_camera": item.nearest.camera if item.nearest else None,
                     "nearest_frame": item.nearest.frame if item.nearest else None,
+                    "crop_camera": item.source.camera if item.source else None,
+                    "crop_frame": item.source.frame if item.source else None,
                     "azimuth": seen.viewpoint.azimuth,
                     "range": seen.viewpoint.distance,
                     "mask_px": int(item.mask.sum()),
@@ -101,7 +111,7 @@ def observation_table(scored: Iterable[Scored]) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=OBSERVATION_SCHEMA)
 
 
-def view_table(training: Iterable[Observation], held_out: Iterable[Observation]) -> pa.Table:
+def view_table(training: Iterable[View], held_out: Iterable[Observation]) -> pa.Table:
     """From where every actor was seen, in training and in the held-out frames."""
     rows = [
         {
@@ -114,8 +124,8 @@ def view_table(training: Iterable[Observation], held_out: Iterable[Observation])
             "azimuth": seen.viewpoint.azimuth,
             "range": seen.viewpoint.distance,
         }
-        for is_training, observations in ((True, training), (False, held_out))
-        for seen in observations
+        for is_training, views in ((True, training), (False, held_out))
+        for seen in views
     ]
     return pa.Table.from_pylist(rows, schema=VIEW_SCHEMA)
 
@@ -135,22 +145,26 @@ def means(observations: pd.DataFrame) -> list[Mean]:
     """Means over observations by group, log and class, for the model and for the baselines, and the model's
     gains.
 
-    Settings are `sparse_view/moved`, `/same`, `/all` (both together) and `/unseen` (actors without any
-    training observation: the model alone). The split is `test`, or `test/<log>` for one log where there are
-    several. Gains are
-    means over observations of the model's value less the baseline's, of LPIPS the other way round, so that a
-    positive gain is always for the better.
+    Settings are `sparse_view/moved`, `/same` and `/all` (both together), in which every predictor has the
+    same observations, and two with the model alone: `/no_crop` (actors seen in training without a kept mask)
+    and `/unseen` (actors without any training view). The split is `test`, or `test/<log>` for one log where
+    there are several. Gains are means over observations of the model's value less the baseline's, of LPIPS
+    the other way round, so that a positive gain is always for the better.
     """
     if observations.empty:
         return []
     frame = _with_caps(observations)
     mask_rule = "mask=" + "+".join(sorted(frame["segmenter"].unique()))
-    groups = {name: frame[frame["group"] == name] for name in ("moved", "same", "unseen")}
-    groups["all"] = frame[frame["group"] != "unseen"]
+    groups = {name: frame[frame["group"] == name] for name in ("moved", "same", *MODEL_ALONE)}
+    groups["all"] = frame[~frame["group"].isin(list(MODEL_ALONE))]
     rows: list[Mean] = []
     for group, part in groups.items():
         for split, class_name, subset in _subsets(part):
-            rows.extend(_means_of(subset, f"sparse_view/{group}", split, class_name, mask_rule))
+            rows.extend(
+                _means_of(
+                    subset, f"sparse_view/{group}", split, class_name, mask_rule + MODEL_ALONE.get(group, "")
+                )
+            )
     return rows
 
 

@@ -6,10 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-FILL = 0.9
-"""Share of the labelled box that the rounded box fills: labels enclose mirrors and antennas too."""
+FILL = 0.85
+"""Share of the labelled box that the rounded box fills: labels enclose mirrors and antennas too. A body that
+starts too small grows; one that starts too large is painted with what lies behind it before it shrinks."""
 
-ROUNDING = 0.6
+ROUNDING = 0.9
 """Corner radius as a share of the smallest half-size."""
 
 

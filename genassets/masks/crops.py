@@ -28,8 +28,7 @@ class CropSettings:
     margin_px, margin_fraction: context around the box, the larger of pixels and of the box's longer side.
     share_growth: boxes share a crop while it is at most this many times as long as each one's own.
     adaptive_magnification: an adaptive tile is at least this many times as long as the crop it shows, where
-    the
-        input allows it.
+        the input allows it.
     """
 
     grouping: Grouping = "adaptive"

@@ -96,9 +96,8 @@ def seed_labels(
     """GrabCut's initial labels (height, width).
 
     Outside the outline: background. Inside: probably foreground. The actor's returns: foreground. Returns
-    of nearer
-    surfaces: background. Returns of farther surfaces: probably background only, because the LiDAR sits
-    above the cameras and sees over actors what is hidden in the image.
+    of nearer surfaces: background. Returns of farther surfaces: probably background only, because the LiDAR
+    sits above the cameras and sees over actors what is hidden in the image.
     """
     labels = np.full((height, width), cv2.GC_BGD, dtype=np.uint8)
     outline = np.round(to_small(prompt.hull)).astype(np.int32)

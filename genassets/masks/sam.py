@@ -1,10 +1,9 @@
 """Box-prompted masks by a SAM or MobileSAM pair of ONNX files.
 
 Kirillov et al., Segment Anything, 2023: an image encoder whose result is reused by a light prompt decoder.
-Any pair
-exported with the official script works: one encoder input (1 x 3 x S x S, normalised) and the decoder
-inputs image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size. A box is two
-points with the labels 2 and 3.
+Any pair exported with the official script works: one encoder input (1 x 3 x S x S, normalised) and the
+decoder inputs image_embeddings, point_coords, point_labels, mask_input, has_mask_input, orig_im_size. A box
+is two points with the labels 2 and 3.
 """
 
 from __future__ import annotations

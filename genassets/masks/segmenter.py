@@ -33,11 +33,6 @@ class Prompt:
     in_front: Array = field(default_factory=_no_pixels)
     behind: Array = field(default_factory=_no_pixels)
 
-    @classmethod
-    def of_box(cls, x0: float, y0: float, x1: float, y1: float) -> Prompt:
-        """A prompt that knows nothing but a rectangle."""
-        return cls((x0, y0, x1, y1), np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]], dtype=np.float64))
-
 
 class Segmenter(Protocol):
     """Finds the visible pixels of prompted objects.

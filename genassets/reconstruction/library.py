@@ -79,7 +79,6 @@ def save_library(library: AssetLibrary, directory: Path) -> None:
         "logs": [
             {
                 "name": name,
-                "root": str(scene.log_root),
                 "origin": scene.origin.tolist(),
                 "occupancy_lower": library.occupancy[name].lower.tolist(),
                 "occupancy_cell": library.occupancy[name].cell,
@@ -127,10 +126,7 @@ def load_library(directory: Path) -> AssetLibrary:
         weights | {n: c.reshape(len(assets), -1) for n, c in zip(LATENTS, codes, strict=True)}
     )
     model.eval()
-    scenes = {
-        entry["name"]: SceneFrame(entry["name"], Path(entry["root"]), np.array(entry["origin"]))
-        for entry in config["logs"]
-    }
+    scenes = {entry["name"]: SceneFrame(entry["name"], np.array(entry["origin"])) for entry in config["logs"]}
     return AssetLibrary(assets, model, settings, scenes, occupancy)
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.driving import Log
-from genassets.driving.sweep import SPINNING_POSITION
-from genassets.geometry.boxes import points_in_box
+from genassets.driving import Log, actor_mask
+from genassets.driving.sweep import SPINNING, SPINNING_POSITION
+from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
 from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 
@@ -23,11 +22,10 @@ Array = NDArray[np.float64]
 class SceneFrame:
     """The world moved by `origin`, so that float32 resolves micrometres instead of centimetres.
 
-    log_root is where the log was read; origin (3,) in world metres.
+    origin (3,) is in world metres.
     """
 
     log_name: str
-    log_root: Path
     origin: Array
 
     def pose(self, world_from_any: Array) -> Array:
@@ -79,7 +77,8 @@ class View:
 class LidarSweepRays:
     """Spinning-LiDAR rays of one sweep in the scene frame: origin (3,), directions (N, 3), distances (N,).
 
-    actor (N,) is the library index of the actor whose padded box holds the return, -1 for none.
+    actor (N,) is the library index of the actor whose padded box holds the return, -1 for none; crossed (N,)
+    that of one whose padded box the ray went through without a return, -1 for none.
     """
 
     frame: int
@@ -87,12 +86,13 @@ class LidarSweepRays:
     direction: Array
     distance: Array
     actor: NDArray[np.int64]
+    crossed: NDArray[np.int64]
     actors: PlacedActors
 
 
 def scene_frame(log: Log) -> SceneFrame:
     """The scene frame of a log: at the middle of the ego car's way."""
-    return SceneFrame(log.name, log.root, log.world_from_ego[:, :3, 3].mean(axis=0))
+    return SceneFrame(log.name, log.world_from_ego[:, :3, 3].mean(axis=0))
 
 
 def rendered_intrinsics(stored: Intrinsics, scale: float, stride: int) -> Intrinsics:
@@ -149,31 +149,47 @@ def lidar_rays(
 ) -> LidarSweepRays:
     """Rays of a sweep's spinning LiDAR up to `farthest` metres.
 
-    The forward LiDAR is left out: PandaSet gives no pose of it, so its rays' origins are not known.
+    Actors stand where they were annotated in this sweep: a moving one was hit there, not where it is at the
+    sweep's stamp. The forward LiDAR is left out: PandaSet gives no pose of it, so its rays' origins are not known.
     """
     sweep = log.sweep(frame)
     origin = transform_points(scene.pose(log.world_from_ego[frame]), SPINNING_POSITION)
-    points = sweep.points[sweep.sensor == 0] - scene.origin
-    offset = points - origin
-    distance = np.linalg.norm(offset, axis=1)
-    keep = (distance > 0.5) & (distance < farthest)
-    points, offset, distance = points[keep], offset[keep], distance[keep]
-    actors = placed_actors(log, frame, float(log.frame_times[frame]), index, scene)
+    points = sweep.points - scene.origin
+    distance = np.linalg.norm(points - origin, axis=1)
+    tracks = [track for track in log.tracks if track.actor_id in index and track.covers(frame)]
     owner = np.full(len(points), -1, dtype=np.int64)
-    for row, (pose, size) in enumerate(zip(actors.scene_from_box, actors.sizes, strict=True)):
-        owner[points_in_box(points, pose, size, padding)] = actors.index[row]
-    return LidarSweepRays(frame, origin, offset / distance[:, None], distance, owner, actors)
+    poses = []
+    for track in tracks:
+        owner[actor_mask(sweep, track, frame, padding)] = index[track.actor_id]
+        poses.append(scene.pose(track.world_from_box[int(np.flatnonzero(track.frames == frame)[0])]))
+    actors = PlacedActors(
+        np.array([index[track.actor_id] for track in tracks], dtype=np.int64),
+        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
+        np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3),
+    )
+    keep = (sweep.sensor == SPINNING) & (distance > 0.5) & (distance < farthest)
+    direction = (points[keep] - origin) / distance[keep, None]
+    distance, owner = distance[keep], owner[keep]
+    crossed = np.full(len(distance), -1, dtype=np.int64)
+    for number, pose, size in zip(actors.index, actors.scene_from_box, actors.sizes, strict=True):
+        box_from_scene = invert_pose(pose)
+        ahead = np.flatnonzero(direction @ (pose[:3, 3] - origin) > 0)
+        start = np.broadcast_to(transform_points(box_from_scene, origin), (len(ahead), 3))
+        toward = transform_directions(box_from_scene, direction[ahead])
+        near, far = intersect_box(start, toward, size + 2 * np.asarray(padding))
+        crossed[ahead[(near < far) & (far < distance[ahead])]] = number
+    crossed[owner >= 0] = -1
+    return LidarSweepRays(frame, origin, direction, distance, owner, crossed, actors)
 
 
 def static_points(log: Log, frames: Iterable[int], scene: SceneFrame, padding: Sequence[float]) -> Array:
     """LiDAR points (N, 3) of some frames in the scene frame, without those inside moving actors' boxes."""
     kept = [np.zeros((0, 3))]
     for frame in frames:
-        points = log.sweep(frame).points
-        moving = np.zeros(len(points), dtype=bool)
+        sweep = log.sweep(frame)
+        moving = np.zeros(len(sweep.points), dtype=bool)
         for track in log.tracks:
-            if not track.stationary and track.covers(frame):
-                pose = track.pose_at(float(log.frame_times[frame]))
-                moving |= points_in_box(points, pose, track.size, padding)
-        kept.append(points[~moving] - scene.origin)
+            if not track.stationary:
+                moving |= actor_mask(sweep, track, frame, padding)
+        kept.append(sweep.points[~moving] - scene.origin)
     return np.concatenate(kept)

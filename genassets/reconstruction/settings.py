@@ -36,11 +36,6 @@ class ModelSettings(_Settings):
     rgb_upsamplings: Annotated[int, Field(ge=0, le=2)] = 1
     coarse_resolution: PositiveInt = 32
 
-    @property
-    def plane_size(self) -> int:
-        """Texels along one side of an actor's planes."""
-        return self.latent_size * 2 ** (len(self.decoder_channels) - 1)
-
     @model_validator(mode="after")
     def _blocks_fit(self) -> ModelSettings:
         if self.rgb_kernel % 2 == 0:

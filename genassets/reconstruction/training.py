@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from genassets.driving import CLASSES
 from genassets.errors import StageError
 from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss
 from genassets.reconstruction.model import AssetModel
@@ -204,8 +206,6 @@ def build_model(
     assets: pd.DataFrame, logs: Sequence[str], settings: ReconstructionSettings, seed: int
 ) -> AssetModel:
     """An untrained model for a table of assets."""
-    from genassets.driving.classes import CLASSES
-
     sizes = torch.tensor(assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64))
     classes = torch.tensor([CLASSES.index(name) for name in assets["actor_class"]], dtype=torch.long)
     return AssetModel(settings.model, sizes, classes, logs, seed)
@@ -224,7 +224,13 @@ def train(
     trainer = Trainer(model, data, settings, seed)
     checkpoint = work_dir / "checkpoint.pt"
     if checkpoint.exists():
-        trainer.restore(torch.load(checkpoint, weights_only=True))
+        try:
+            trainer.restore(torch.load(checkpoint, weights_only=True))
+        except (RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
+            raise StageError(
+                f"{checkpoint}: cannot be continued from ({error}); expected a checkpoint of this reconstruction. "
+                "Delete the file to train from the start."
+            ) from error
     while trainer.step < settings.steps:
         result = trainer.advance()
         step = trainer.step
@@ -233,7 +239,8 @@ def train(
                 curve(f"loss/{term}", step, value.item())
             psnr = -10 * math.log10(max(result.losses["rgb"].item(), 1e-10))
             curve("training/patch_psnr", step, psnr)
-            curve("training/samples_shaded", step, result.counts.shaded)
+            for name, count in asdict(result.counts).items():
+                curve(f"samples/{name}", step, count)
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
         if step % settings.checkpoint_every == 0 and step < settings.steps:
             save_checkpoint(trainer, checkpoint)

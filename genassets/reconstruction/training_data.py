@@ -29,8 +29,10 @@ from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import BOX_PADDING, Rays, cast_rays, concatenate_rays
 from genassets.rendering.sampling import OccupancyGrid
 
-LIDAR_SHARE_ON_ACTORS = 0.75
-"""Share of a batch's LiDAR rays that end on an actor; the rest keeps the background in place."""
+LIDAR_SHARE_ON_ACTORS = 0.5
+LIDAR_SHARE_THROUGH_ACTORS = 0.35
+"""Shares of a batch's LiDAR rays that end on an actor, and that went through an actor's box unhindered and show
+where it is not; the rest keeps the background in place."""
 
 LIDAR_BEHIND = 2.0
 """Metres that a LiDAR ray is followed beyond its return: weight found there is an error to learn from."""
@@ -260,10 +262,17 @@ def _draw_lidar(
     if not count or not sweeps:
         return [], torch.zeros(0)
     sweep = sweeps[int(rng.integers(len(sweeps)))]
-    on, off = np.flatnonzero(np.isin(sweep.actor, met)), np.flatnonzero(sweep.actor < 0)
-    on = rng.choice(on, min(round(count * LIDAR_SHARE_ON_ACTORS), len(on)), replace=False)
-    off = rng.choice(off, min(count - len(on), len(off)), replace=False)
-    chosen = np.concatenate((on, off))
+    groups = (
+        (np.isin(sweep.actor, met), LIDAR_SHARE_ON_ACTORS),
+        (np.isin(sweep.crossed, met), LIDAR_SHARE_THROUGH_ACTORS),
+        ((sweep.actor < 0) & (sweep.crossed < 0), 1 - LIDAR_SHARE_ON_ACTORS - LIDAR_SHARE_THROUGH_ACTORS),
+    )
+    chosen = np.concatenate(
+        [
+            rng.choice(np.flatnonzero(g), min(round(count * share), int(g.sum())), replace=False)
+            for g, share in groups
+        ]
+    )
     distance = sweep.distance[chosen]
     placed = sweep.actors.select(np.isin(sweep.actors.index, met))
     cast = cast_rays(

@@ -46,7 +46,7 @@ LOG_HIDDEN = -6.0
 class RenderSettings:
     """Step lengths and culls of one rendering. All lengths in metres.
 
-    exact: no occupancy and no weight threshold; every sample of every crossed box is evaluated.
+    exact: no coarse distance and no weight threshold; every sample of every crossed box is evaluated.
     """
 
     actor_step: float

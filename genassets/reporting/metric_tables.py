@@ -30,7 +30,7 @@ NAMES = {
     "f_score": "F-score",
     "chamfer": "Chamfer, m",
 }
-GROUP_ORDER = ("sparse_view/moved", "sparse_view/same", "sparse_view/all", "sparse_view/unseen")
+GROUP_ORDER = tuple(f"sparse_view/{group}" for group in ("moved", "same", "all", "no_crop", "unseen"))
 PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
 
 

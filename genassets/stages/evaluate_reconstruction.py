@@ -6,6 +6,7 @@ skipped.parquet and pictures. docs/evaluation.md says what each measure means.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from genassets.driving.log import Log
-    from genassets.evaluation.sparse_view import ImageRenderer, Observation, Scored, Skipped
+    from genassets.evaluation.sparse_view import ImageRenderer, Observation, Scored, Skipped, View
     from genassets.export.picture_list import PictureList
 
 
@@ -35,20 +36,38 @@ class EvaluateReconstructionConfig(BaseModel):
 
     split: Split = Split()
     moved_degrees: float = Field(
-        2.0, gt=0, description="A viewpoint has moved beyond this angle from every training viewpoint."
+        default=2.0,
+        gt=0,
+        description="A viewpoint has moved beyond this angle from every training viewpoint.",
     )
     moved_metres: float = Field(
-        0.5, gt=0, description="A viewpoint has moved beyond this change of distance to the actor."
+        default=0.5, gt=0, description="A viewpoint has moved beyond this change of distance to the actor."
     )
-    padding: int = Field(2, ge=0, description="Pixels around the box's bounds, at the compared size.")
+    min_box_px: float = Field(
+        default=100.0,
+        ge=0,
+        description="Area of the box in a 1920 x 1080 image, counted in proportion to the stored image's, from "
+        "which a training image counts as a viewpoint; a kept observation always does.",
+    )
+    max_occluded: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="Largest covered part of the box (filter_occlusion's measure) of a training viewpoint.",
+    )
+    padding: int = Field(default=2, ge=0, description="Pixels around the box's bounds, at the compared size.")
     least_mask_px: int = Field(
-        8,
+        default=8,
         ge=1,
         description="Observations with fewer masked pixels at the compared size are counted, not scored.",
     )
-    lpips: bool = Field(True, description="Measure LPIPS; needs the pretrained file lpips-alexnet.")
-    pictured_actors: int = Field(6, ge=0, description="Actors in each picture: best, middle and worst.")
-    whole_frames: int = Field(2, ge=0, description="Test frames per log rendered whole beside the truth.")
+    lpips: bool = Field(default=True, description="Measure LPIPS; needs the pretrained file lpips-alexnet.")
+    pictured_actors: int = Field(
+        default=6, ge=0, description="Actors in each picture: best, middle and worst."
+    )
+    whole_frames: int = Field(
+        default=2, ge=0, description="Test frames per log rendered whole beside the truth."
+    )
 
 
 def run(
@@ -79,35 +98,34 @@ def run(
     pictures = PictureList(out)
     scored: list[Scored] = []
     skipped: list[Skipped] = []
-    training: list[Observation] = []
-    held_out: list[Observation] = []
     tables, logs = inputs.shards("filter_occlusion"), inputs.shards("ingest")
-    for index, (shard, table_path) in enumerate(tables.items()):
+    seen = {shard: _seen(path, config) for shard, path in tables.items()}
+    if any(log.held_out for log in seen.values()) and not any(log.training for log in seen.values()):
+        raise StageError(
+            "evaluate_reconstruction: no observation of a training frame was kept, so there are no baselines; "
+            "let prepare_masks make masks of all frames (prepare_masks.frames: all)."
+        )
+    for index, (shard, observed) in enumerate(seen.items()):
         log = open_ingested(logs[shard])
-        log_training, log_held_out = _observations(table_path, config.split)
         library = frozenset(renderer.assets.loc[renderer.assets["log"] == log.name, "actor_id"])
 
         def report(done: int, total: int, index: int = index, name: str = log.name) -> None:
             context.progress(index + done / total, len(tables), f"log {name}, image {done} of {total}")
 
         log_scored, log_skipped = evaluate_log(
-            log, log_training, log_held_out, library, renderer, lpips, comparison, report
-        )
+            log, observed.views, observed.training, observed.held_out, library, renderer, lpips, comparison,
+            report,
+        )  # fmt: skip
         _picture_whole_frames(log, log_scored, renderer, config.whole_frames, pictures)
-        training += log_training
-        held_out += log_held_out
         scored += log_scored
         skipped += log_skipped
 
-    if scored and not training:
-        raise StageError(
-            "evaluate_reconstruction: no observation of a training frame was kept, so there are no baselines and "
-            "no view groups; let prepare_masks make masks of all frames (prepare_masks.frames: all)."
-        )
     table = observation_table(scored)
     observations: pd.DataFrame = table.to_pandas()
     pq.write_table(table, out / "observations.parquet")
-    pq.write_table(view_table(training, held_out), out / "views.parquet")
+    views = [view for log in seen.values() for view in log.views]
+    held_out = [observation for log in seen.values() for observation in log.held_out]
+    pq.write_table(view_table(views, held_out), out / "views.parquet")
     actor_table(observations).to_parquet(out / "actors.parquet", index=False)
     _write_skipped(skipped, out / "skipped.parquet")
     _picture_actors(scored, config.pictured_actors, pictures)
@@ -115,44 +133,63 @@ def run(
     return [Metric(*mean) for mean in means(observations)] + _counts(scored, skipped)
 
 
-def _observations(path: Path, split: Split) -> tuple[list[Observation], list[Observation]]:
-    """Kept observations of the training frames and of the held-out frames."""
+@dataclass(frozen=True)
+class _Seen:
+    """One log's views of actors in training images, and its kept observations in training and test images."""
+
+    views: list[View]
+    training: list[Observation]
+    held_out: list[Observation]
+
+
+def _seen(path: Path, config: EvaluateReconstructionConfig) -> _Seen:
+    """Read the views and observations of one log from the object table under `path`."""
+    from genassets.curation.acceptance import REFERENCE_PIXELS
     from genassets.curation.object_table import (
         bounds_of,
         box_from_camera_of,
         mask_of,
         read_object_table,
     )
-    from genassets.evaluation.sparse_view import Observation
+    from genassets.evaluation.sparse_view import Observation, View
     from genassets.evaluation.viewpoint import viewpoint_of
 
     rows = read_object_table(path / "objects.parquet")
-    training: list[Observation] = []
-    held_out: list[Observation] = []
-    for row in rows[rows["kept"]].itertuples(index=False):
+    split = config.split
+    box_px = (rows["x1"] - rows["x0"]) * (rows["y1"] - rows["y0"])
+    least_px = config.min_box_px * rows["mask_width"] * rows["mask_height"] / REFERENCE_PIXELS
+    visible = (box_px >= least_px) & (rows["occluded"] <= config.max_occluded)
+    seen = _Seen([], [], [])
+    for row in rows[rows["kept"] | visible].itertuples(index=False):
         frame, camera = int(cast(int, row.frame)), str(row.camera)
         trains = split.is_training(frame)
         if camera not in split.train_cameras if trains else camera != split.camera:
             continue
-        observation = Observation(
+        view = View(
             log=str(row.log),
             frame=frame,
             camera=camera,
             actor_id=str(row.actor_id),
             actor_class=str(row.actor_class),
-            bounds=bounds_of(row),
-            mask=partial(mask_of, row),
-            segmenter=str(row.segmenter),
             viewpoint=viewpoint_of(box_from_camera_of(row)),
         )
-        (training if trains else held_out).append(observation)
-    return training, held_out
+        if trains:
+            seen.views.append(view)
+        if row.kept:
+            observation = Observation(
+                **vars(view),
+                bounds=bounds_of(row),
+                mask=partial(mask_of, row),
+                segmenter=str(row.segmenter),
+            )
+            (seen.training if trains else seen.held_out).append(observation)
+    return seen
 
 
 def _counts(scored: list[Scored], skipped: list[Skipped]) -> list[Metric]:
     """How many observations and actors stand behind the means, and how many were left out and why."""
     rows = []
-    for group in ("moved", "same", "unseen"):
+    for group in ("moved", "same", "no_crop", "unseen"):
         items = [item for item in scored if item.group == group]
         actors = {(item.observation.log, item.observation.actor_id) for item in items}
         setting = f"sparse_view/{group}"

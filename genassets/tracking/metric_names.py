@@ -20,7 +20,7 @@ def clean_name(text: str) -> str:
 
 
 def named_metrics(rows: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Metric name to finite value, such as "evaluate_reconstruction/sparse_view/test/Car/psnr".
+    """Metric name to finite value, such as "evaluate_reconstruction/sparse_view/moved/test/Car/psnr".
 
     Where rows differ in nothing else, the first part of the method is appended ("psnr/mean_colour"), except
     for the model itself: its metric keeps the plain name. MLflow cannot store NaN on every backend, so
