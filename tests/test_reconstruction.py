@@ -196,7 +196,7 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(
 
     def poison(name: str, step: int, value: float) -> None:
         if step == 3:
-            model.rgb.image.bias.data.fill_(math.nan)
+            model.rgb.image.weight.data.fill_(math.nan)
 
     with pytest.raises(StageError, match=r"'rgb' is nan at step 3 \(log tiny, actors \[\d") as caught:
         train(model, prepared.data, SETTINGS, 0, tmp_path, lambda *_: None, poison)
@@ -406,7 +406,8 @@ def test_the_paper_profile_is_the_papers_model() -> None:
         assert model.rgb(torch.zeros(1, 32, 4, 4)).shape == (1, 3, 16, 16)
     assert model.backgrounds[0].planes.shape == (1, 3, 12, 256, 256)
     assert len(model.rgb.blocks) == 6
-    assert {tuple(c.weight.shape) for b in model.rgb.blocks for c in (b.conv1, b.conv2)} == {(32, 32, 5, 5)}
+    kernels = {tuple(p.shape) for name, p in model.rgb.blocks.named_parameters() if name.endswith("weight")}
+    assert kernels == {(32, 32, 5, 5)}
     rates, weights, rendering = settings.rates, settings.weights, settings.rendering
     assert (rates.latent, rates.decoder, rates.field, rates.rgb) == (0.05, 1e-4, 1e-3, 1e-3)
     assert (weights.rgb, weights.lidar, weights.kl) == (1.0, 0.01, 1e-5)
