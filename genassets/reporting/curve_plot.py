@@ -50,7 +50,8 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
         )
         axes = figure.subplots(lines, columns, squeeze=False).ravel()
         for axis, (name, steps, values) in zip(axes, curves, strict=False):
-            axis.plot(steps, values, color="#9db7d5", linewidth=0.8)
+            alone = "o" if len(values) == 1 else None  # a line through one point shows nothing
+            axis.plot(steps, values, color="#9db7d5", linewidth=0.8, marker=alone)
             if len(values) >= 20:
                 axis.plot(steps, running_mean(values, len(values) // 40), color="#1f4e8c", linewidth=1.4)
             if values.min() > 0 and values.max() / values.min() > LOG_RANGE:
