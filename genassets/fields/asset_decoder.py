@@ -73,19 +73,26 @@ class AssetDecoder(nn.Module):
         self.blocks = nn.ModuleList(ResidualBlock(cin, cout, groups) for cin, cout in pairs)
         self.norm = nn.GroupNorm(_groups(groups, channels[-1]), channels[-1])
         self.planes = nn.Conv2d(channels[-1], 3 * plane_channels, 3, padding=1)
+        self.coarse = nn.Conv2d(2 * latent_channels, 3 * plane_channels, 1)
 
     def forward(
         self, latent: Float[Tensor, "n c h w"], embedding: Float[Tensor, "n c h w"]
     ) -> Float[Tensor, "n 3 channels height width"]:
         """Decode n actors; height = h x 2^(number of blocks - 1)."""
         x = torch.cat((latent, embedding), dim=1).contiguous(memory_format=torch.channels_last)
+        coarse = self.coarse(x)
         x = self.middle(self.head(x))
         for index, block in enumerate(self.blocks):
             x = block(F.interpolate(x, scale_factor=2, mode="nearest") if index else x)
         planes = self.planes(F.silu(self.norm(x)))
+        planes = planes + F.interpolate(coarse, planes.shape[-2:], mode="bilinear", align_corners=False)
         return planes.reshape(len(planes), 3, self.plane_channels, *planes.shape[-2:])
 
 
 def _groups(wanted: int, channels: int) -> int:
-    """The largest divisor of channels up to wanted, so that narrow profiles normalise too."""
-    return next(groups for groups in range(min(wanted, channels), 0, -1) if channels % groups == 0)
+    """The largest divisor of channels up to wanted that leaves two channels a group or more.
+
+    A group of one channel is instance normalisation, which takes away what is constant over a plane: an
+    actor's paint.
+    """
+    return next(groups for groups in range(min(wanted, channels // 2), 0, -1) if channels % groups == 0)

@@ -64,7 +64,10 @@ class AssetModel(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
             self.decoder = AssetDecoder(
-                settings.latent_channels, settings.decoder_channels, settings.plane_channels
+                settings.latent_channels,
+                settings.decoder_channels,
+                settings.plane_channels,
+                settings.decoder_groups,
             )
             self.field = FeatureField(3 * settings.plane_channels, settings.field_hidden, settings.features)
             self.background_field = FeatureField(

@@ -19,8 +19,9 @@ class ModelSettings(_Settings):
     """Sizes of latents, decoder, fields and image network."""
 
     latent_size: PositiveInt = 8
-    latent_channels: PositiveInt = 16
+    latent_channels: PositiveInt = 32
     decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)
+    decoder_groups: PositiveInt = Field(default=32, description="groups of group normalisation, at most")
     plane_channels: PositiveInt = 8
     field_hidden: PositiveInt = 48
     sharpness: PositiveFloat = Field(default=20.0, description="beta at the start, in 1/m")
@@ -68,7 +69,7 @@ class RenderingSettings(_Settings):
 class LearningRates(_Settings):
     """Adam's rates at the start; all fall along a half cosine to `final` times their start."""
 
-    latent: PositiveFloat = 0.05
+    latent: PositiveFloat = 0.1
     decoder: PositiveFloat = 2e-3
     field: PositiveFloat = 5e-3
     sharpness: PositiveFloat = 0.05
