@@ -61,7 +61,10 @@ def test_commands_are_handed_on_with_their_arguments(checkout: Path) -> None:
     assert call(checkout, "inspect", "a log").stdout == "genassets inspect a log\n"
     assert call(checkout, "bench", "--json").stdout == "genassets bench --json\n"
     demo = call(checkout, "demo", "--set", "seed=1").stdout.splitlines()
-    assert demo == ["genassets weights fetch --quiet", "genassets run demo --set seed=1"]
+    assert demo == [
+        "genassets weights fetch --quiet sam-encoder sam-decoder lpips-alexnet",
+        "genassets run demo --set seed=1",
+    ]
 
 
 def test_test_checks_style_and_types_before_it_runs_the_tests(checkout: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from genassets.city_spec import CitySpec
+from genassets.city_spec import ALL_CLASSES, CitySpec
 from genassets.driving import CLASSES, class_of, open_log
 from genassets.driving.synthetic.actors import Actor
 from genassets.driving.synthetic.fleet import STYLES, Model, build_model, ego_model, in_box_frame
@@ -360,3 +360,8 @@ def test_ego_car_is_below_its_cameras() -> None:
     model = ego_model()
     assert all(mount.ego_from_camera[2, 3] > model.size[2] for mount in CAMERA_RIG.values())
     assert parked((1.0, 2.0), 0.3).stationary
+
+
+def test_the_city_knows_the_classes_of_the_logs() -> None:
+    # Written in both, so that reading a spec imports no numpy and a change of the city concerns the city alone.
+    assert ALL_CLASSES == CLASSES

@@ -2,9 +2,16 @@
 
 from __future__ import annotations
 
-from genassets.city_spec import ALL_CLASSES
-
-CLASSES: tuple[str, ...] = ALL_CLASSES
+CLASSES = (
+    "Car",
+    "Truck",
+    "Bus",
+    "Construction Vehicle",
+    "Emergency Vehicle",
+    "Bicycle",
+    "Motorcycle",
+    "Pedestrian",
+)
 VEHICLE_CLASSES = CLASSES[:5]
 
 _CLASS_OF_LABEL = {
