@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,7 @@ def rgb_error(trainer: Trainer) -> float:
         draw_batch(trainer.data[0], SETTINGS, STRIDE, np.random.default_rng(number)) for number in range(6)
     ]
     with torch.no_grad():
-        return float(np.mean([trainer.losses(0, batch, None).losses["rgb"].item() for batch in batches]))
+        return float(np.mean([trainer.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches]))
 
 
 @pytest.fixture(scope="module")
@@ -139,6 +140,42 @@ def test_a_loss_that_is_not_finite_stops_and_keeps_the_last_checkpoint(
     kept = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     assert kept["step"] == 2
     assert all(value.isfinite().all() for value in kept["model"].values())
+
+
+def spoil_the_loss(model: AssetModel) -> None:
+    model.rgb.image.weight.data.fill_(math.nan)
+
+
+def spoil_a_dense_gradient(model: AssetModel) -> None:
+    model.rgb.image.weight.register_hook(lambda gradient: gradient * math.inf)
+
+
+def spoil_a_sparse_gradient(model: AssetModel) -> None:
+    model.latent_mean.weight.register_hook(lambda gradient: gradient * math.nan)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (spoil_the_loss, "the loss term 'rgb' is nan at step 2 "),
+        (spoil_a_dense_gradient, r"not finite in rgb \((nan|inf)\) at step 2 "),
+        (spoil_a_sparse_gradient, r"not finite in latent_mean \(nan\) at step 2 "),
+    ],
+)
+def test_a_step_that_is_not_finite_changes_nothing(
+    prepared: Prepared, tmp_path: Path, spoil: Callable[[AssetModel], None], message: str
+) -> None:
+    """A gradient may be infinite where the loss is finite; in parameters it would reach the next checkpoint."""
+    trainer = prepared.trainer()
+    trainer.advance()
+    trainer.advance()
+    spoil(trainer.model)
+    before, after = tmp_path / "before.pt", tmp_path / "after.pt"
+    training.save_checkpoint(trainer, before)
+    with pytest.raises(StageError, match=message + r"\(log tiny, actors \[\d"):
+        trainer.advance()
+    training.save_checkpoint(trainer, after)
+    assert after.read_bytes() == before.read_bytes()
 
 
 def test_a_step_learns_from_the_decoded_actors_alone(prepared: Prepared) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import torch
 from torch import Tensor
+from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
 from genassets.errors import StageError
@@ -21,7 +22,7 @@ from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
-from genassets.rendering.renderer import RenderSettings, SampleCounts, cull, render_rays
+from genassets.rendering.renderer import ActorFields, RenderSettings, SampleCounts, cull, render_rays
 
 CURVE_EVERY = 20
 
@@ -31,7 +32,7 @@ Curve = Callable[[str, int, float], None]
 
 @dataclass(frozen=True)
 class StepResult:
-    """The terms of one step, unweighted, and the actors that it met."""
+    """The terms of one step, unweighted, and the actors that it learned."""
 
     losses: dict[str, Tensor]
     actors: Tensor
@@ -81,46 +82,58 @@ class Trainer:
         """One optimisation step.
 
         Raises:
-            StageError: a loss is not finite; names term, step and actors. Nothing was changed by the step.
+            StageError: a loss or a gradient is not finite; names term or parameters, step, log and actors.
+                The step has then changed nothing of `state`.
         """
         rng = np.random.default_rng([self.seed, self.step])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         number = int(rng.choice(len(self.data), p=self.log_chance))
         batch = draw_batch(self.data[number], self.settings, self.model.stride, rng)
-        result = self.losses(number, batch, generator)
+        result, fields = self.losses(number, batch, generator)
         weights = self.settings.weights.model_dump()
         for term, value in result.losses.items():
             if not torch.isfinite(value):
-                raise StageError(
-                    f"reconstruct: the loss term {term!r} is {value.item()} at step {self.step} "
-                    f"(log {self.data[number].scene.log_name}, actors {result.actors.tolist()}); training stopped. "
-                    "The last checkpoint is kept: lower the learning rates and run again."
-                )
+                raise self._stopped(f"the loss term {term!r} is {value.item()}", number, result)
         total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
-        self._set_rates()
         self.dense.zero_grad(set_to_none=True)
         self.sparse.zero_grad(set_to_none=True)
         total.backward()
+        gradients = _gradients(self.model)
+        if not torch.isfinite(get_total_norm(value for values in gradients.values() for value in values)):
+            norms = {part: get_total_norm(values).item() for part, values in gradients.items()}
+            bad = ", ".join(f"{part} ({norm})" for part, norm in norms.items() if not math.isfinite(norm))
+            raise self._stopped(
+                f"the gradient's norm is not finite in {bad or 'all parts together'}", number, result
+            )
+        self._remember(result.actors, fields)
+        self._set_rates()
         self.dense.step()
         self.sparse.step()
         self.step += 1
         return result
 
-    def losses(self, number: int, batch: Batch, generator: torch.Generator | None) -> StepResult:
-        """Render a batch of log `number` and compare it with what was observed."""
+    def _stopped(self, why: str, number: int, result: StepResult) -> StageError:
+        return StageError(
+            f"reconstruct: {why} at step {self.step} "
+            f"(log {self.data[number].scene.log_name}, actors {result.actors.tolist()}); training stopped. "
+            "The last checkpoint is kept: lower the learning rates and run again."
+        )
+
+    def losses(
+        self, number: int, batch: Batch, generator: torch.Generator | None
+    ) -> tuple[StepResult, ActorFields]:
+        """Render a batch of log `number` and compare it with what was observed; changes nothing.
+
+        Also returns the fields that were rendered: those of the actors learned, then of bystanders.
+        """
         model, settings = self.model, self.settings
         rendering = render_settings(settings.rendering)
         culled = cull(batch.rays, model.coarse_actors(), rendering, generator)
         actors, bystanders = self._split_actors(culled.samples_of_actors(batch.rays))
         latents = model.latents(actors, generator)
         decoded = model.decode(actors, latents.code)
-        self.planes[actors] = decoded.detach().half()
         planes = torch.cat((decoded, self.planes[bystanders].float()))
         fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
-        if self.step % settings.rendering.coarse_refresh == 0:
-            stalest = int(actors[self.refreshed[actors].argmin()])
-            model.refresh_coarse_distance(stalest, fields)
-            self.refreshed[stalest] = self.step + 1
         background = model.background_fields(number, self.data[number].occupancy)
         rendered = render_rays(batch.rays, culled, fields, background, rendering, generator)
         camera_rays = batch.patches * batch.side**2
@@ -133,7 +146,15 @@ class Trainer:
         if len(batch.lidar_distance):
             distance = rendered.distance[camera_rays:]
             losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
-        return StepResult(losses, actors, rendered.counts)
+        return StepResult(losses, actors, rendered.counts), fields
+
+    def _remember(self, actors: Tensor, fields: ActorFields) -> None:
+        """Keep what a step decoded: planes for when its actors are bystanders, one actor's coarse distance."""
+        self.planes[actors] = fields.planes[: len(actors)].detach().half()
+        if self.step % self.settings.rendering.coarse_refresh == 0:
+            stalest = int(actors[self.refreshed[actors].argmin()])
+            self.model.refresh_coarse_distance(stalest, fields)
+            self.refreshed[stalest] = self.step + 1
 
     def _split_actors(self, samples: Tensor) -> tuple[Tensor, Tensor]:
         """Actors to decode and learn from, those with most samples; and the others that are met."""
@@ -200,6 +221,16 @@ def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, 
         {"params": list(model.backgrounds.parameters()), "lr": rates.background},
         {"params": list(model.rgb.parameters()), "lr": rates.rgb},
     ]
+
+
+def _gradients(model: AssetModel) -> dict[str, list[Tensor]]:
+    """The gradients of the last backward pass by part of the model; of sparse ones the rows that there are."""
+    parts: dict[str, list[Tensor]] = {}
+    for name, parameter in model.named_parameters():
+        if (gradient := parameter.grad) is not None:
+            values = gradient.coalesce().values() if gradient.is_sparse else gradient
+            parts.setdefault(name.partition(".")[0], []).append(values)
+    return parts
 
 
 def build_model(
