@@ -239,9 +239,10 @@ def test_a_region_is_rendered_as_in_the_whole_frame(renderer: SceneRenderer, log
     assert whole.shape == (intrinsics.height, intrinsics.width, 3) == (54, 96, 3)
     assert whole.dtype == np.float32
     assert whole.min() >= 0 and whole.max() <= 1
-    part = renderer.render_image(log, "front_camera", 1, (9, 21, 40, 46))
-    assert part.shape == (25, 31, 3)
-    np.testing.assert_allclose(part, whole[21:46, 9:40], atol=2e-3)
+    for x0, y0, x1, y1 in ((9, 21, 40, 46), (60, 30, 61, 31), (51, 0, 96, 20), (40, 30, 50, 54)):
+        part = renderer.render_image(log, "front_camera", 1, (x0, y0, x1, y1))
+        assert part.shape == (y1 - y0, x1 - x0, 3)
+        np.testing.assert_allclose(part, whole[y0:y1, x0:x1], atol=1e-5)
 
 
 def test_an_actor_alone_fills_its_middle_and_nothing_else(renderer: SceneRenderer) -> None:

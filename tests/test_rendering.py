@@ -239,3 +239,25 @@ def test_paper_image_network_turns_480_x_270_into_1920_x_1080_by_four() -> None:
     assert image.shape == (1, 3, 108, 192)
     # Untrained, it shows the first three features as they are, around mid-grey.
     assert image.numpy() == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "blocks", "upsamplings", "reach"),
+    [(3, 2, 0, 5), (3, 3, 1, 6), (3, 2, 1, 5), (5, 4, 1, 14), (1, 4, 2, 1), (5, 6, 2, 16)],
+)
+def test_the_image_network_reaches_as_far_as_it_says(
+    kernel: int, blocks: int, upsamplings: int, reach: int
+) -> None:
+    """Positive weights throughout: a gradient is zero only where nothing is read."""
+    network = RgbNetwork(3, 2, kernel, blocks, upsamplings).double()
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.fill_(0.1)
+    side, middle, stride = 2 * reach + 7, reach + 3, 2**upsamplings
+    features = torch.ones(1, 3, side, side, dtype=torch.float64, requires_grad=True)
+    pixels = slice(middle * stride, (middle + 1) * stride)
+    network(features)[..., pixels, pixels].sum().backward()
+    assert features.grad is not None
+    read = torch.nonzero(features.grad[0].abs().sum(dim=(0, 1)))[:, 0]
+    assert network.reach == reach
+    assert read.tolist() == list(range(middle - reach, middle + reach + 1))

@@ -14,6 +14,7 @@ from genassets.driving.sweep import SPINNING, SPINNING_POSITION
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
 from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
+from genassets.rendering.rays import BOX_PADDING
 
 Array = NDArray[np.float64]
 
@@ -51,7 +52,8 @@ class PlacedActors:
 class View:
     """One camera at one frame, at the rendered size, with the actors in the image.
 
-    bounds (A, 4): x0, y0, x1, y1 of each actor's box in pixels of the rendered image.
+    bounds (A, 4): x0, y0, x1, y1 of each actor's box in pixels of the rendered image. padded_bounds (A, 4): the
+    same of its padded box, not clipped to the image: outside them no ray meets the actor.
     """
 
     camera: str
@@ -60,6 +62,7 @@ class View:
     scene_from_camera: Array
     actors: PlacedActors
     bounds: Array
+    padded_bounds: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Origins and unit directions (N, 3) in the scene frame of the rays through pixels (N, 2)."""
@@ -67,9 +70,9 @@ class View:
         return np.broadcast_to(self.scene_from_camera[:3, 3], directions.shape), directions
 
     def actors_in(self, region: tuple[float, float, float, float]) -> PlacedActors:
-        """The actors whose bounds overlap a region (x0, y0, x1, y1) of the image."""
+        """The actors that rays through a region (x0, y0, x1, y1), which may leave the image, can meet."""
         x0, y0, x1, y1 = region
-        b = self.bounds
+        b = self.padded_bounds
         return self.actors.select((b[:, 0] < x1) & (b[:, 2] > x0) & (b[:, 1] < y1) & (b[:, 3] > y0))
 
 
@@ -123,13 +126,24 @@ def make_view(
     actors = placed_actors(log, frame, float(stream.times[frame]), index, scene)
     scene_from_camera = scene.pose(stream.world_from_camera[frame])
     camera_from_scene = invert_pose(scene_from_camera)
-    projections = [
-        project_box(intrinsics, camera_from_scene @ pose, size)
-        for pose, size in zip(actors.scene_from_box, actors.sizes, strict=True)
-    ]
-    visible = np.array([projection is not None for projection in projections], dtype=bool)
-    bounds = np.array([p.bounds for p in projections if p is not None], dtype=np.float64).reshape(-1, 4)
-    return View(camera, frame, intrinsics, scene_from_camera, actors.select(visible), bounds)
+    visible = np.zeros(len(actors.index), dtype=bool)
+    bounds, padded_bounds = [], []
+    for row, (pose, size) in enumerate(zip(actors.scene_from_box, actors.sizes, strict=True)):
+        box = project_box(intrinsics, camera_from_scene @ pose, size)
+        padded = project_box(intrinsics, camera_from_scene @ pose, size + 2 * np.array(BOX_PADDING))
+        if box is not None and padded is not None:
+            visible[row] = True
+            bounds.append(box.bounds)
+            padded_bounds.append([*padded.hull.min(axis=0), *padded.hull.max(axis=0)])
+    return View(
+        camera,
+        frame,
+        intrinsics,
+        scene_from_camera,
+        actors.select(visible),
+        np.array(bounds, dtype=np.float64).reshape(-1, 4),
+        np.array(padded_bounds, dtype=np.float64).reshape(-1, 4),
+    )
 
 
 def load_image(log: Log, view: View) -> NDArray[np.uint8]:

@@ -25,8 +25,6 @@ from genassets.rendering.rays import cast_rays
 from genassets.rendering.renderer import ActorFields, actor_distance, cull, padded_half_size, render_rays
 
 RAYS_AT_ONCE = 8192
-CONTEXT = 4
-"""Feature pixels rendered around a region, so that the image network sees no border inside it."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +42,8 @@ class SceneRenderer:
     def __init__(self, library: AssetLibrary, exact: bool = False) -> None:
         self.library = library
         self._settings = render_settings(library.settings.rendering, exact)
+        # Feature pixels rendered around a region, so that the image network sees no border inside it.
+        self._context = library.model.rgb.reach
         self._planes = lru_cache(maxsize=256)(self._decode)
 
     @classmethod
@@ -75,9 +75,9 @@ class SceneRenderer:
         """The composited scene (h, w, 3) in [0, 1], in a region x0, y0, x1, y1 of the rendered image."""
         view = self.view(log, camera, frame)
         x0, y0, x1, y1 = region or (0, 0, view.intrinsics.width, view.intrinsics.height)
-        stride = self.library.model.stride
-        fx0, fy0 = x0 // stride - CONTEXT, y0 // stride - CONTEXT
-        fx1, fy1 = -(-x1 // stride) + CONTEXT, -(-y1 // stride) + CONTEXT
+        stride, context = self.library.model.stride, self._context
+        fx0, fy0 = x0 // stride - context, y0 // stride - context
+        fx1, fy1 = -(-x1 // stride) + context, -(-y1 // stride) + context
         rows_at_once = max(1, RAYS_AT_ONCE // (fx1 - fx0))
         background = self.library.model.background_fields(
             self.library.model.logs.index(log.name), self.library.occupancy[log.name]
@@ -104,9 +104,9 @@ class SceneRenderer:
         Feature rays run one for each stride x stride pixels, as in training; alpha and depth are enlarged.
         """
         actor = self.library.index_of(log_name, actor_id)
-        stride = self.library.model.stride
+        stride, context = self.library.model.stride, self._context
         width, height = -(-intrinsics.width // stride), -(-intrinsics.height // stride)
-        pixels = pixel_centres(-CONTEXT, -CONTEXT, width + CONTEXT, height + CONTEXT) * stride
+        pixels = pixel_centres(-context, -context, width + context, height + context) * stride
         directions = transform_directions(box_from_camera, pixel_directions(intrinsics, pixels))
         origins = np.broadcast_to(np.asarray(box_from_camera)[:3, 3], directions.shape)
         size = self.assets.loc[actor, ["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
@@ -118,7 +118,7 @@ class SceneRenderer:
             culled = cull(rays, self.library.model.coarse_actors(), self._settings)
             out = render_rays(rays, culled, fields, None, self._settings)
             parts.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
-        grid = (1, height + 2 * CONTEXT, width + 2 * CONTEXT, -1)
+        grid = (1, height + 2 * context, width + 2 * context, -1)
         maps = torch.cat(parts).reshape(grid).permute(0, 3, 1, 2)
         feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
         rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3)).clamp(0, 1)
@@ -126,7 +126,7 @@ class SceneRenderer:
             torch.nn.functional.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False)
             for m in (alpha, distance)
         )
-        margin = CONTEXT * stride
+        margin = context * stride
 
         def crop(image: Tensor) -> NDArray[np.float32]:
             inside = image[0, :, margin : margin + intrinsics.height, margin : margin + intrinsics.width]

@@ -101,7 +101,10 @@ class ReconstructionSettings(_Settings):
     )
     patch_size: PositiveInt = Field(default=32, description="side of a training patch in feature pixels")
     patch_margin: Annotated[int, Field(ge=0)] = Field(
-        default=2, description="feature pixels rendered around a patch as context for the image network"
+        default=2,
+        description="feature pixels rendered around a patch as context for the image network. A trade-off: fewer "
+        "than the network reaches, so that patches' edges are learned without all that a whole frame shows there, "
+        "but every one more is rendered all around every patch",
     )
     background_share: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.15, description="share of patches placed anywhere in an image rather than on an actor"

@@ -23,12 +23,28 @@ class RgbNetwork(nn.Module):
             raise ValueError(
                 f"{blocks} blocks leave no place for {upsamplings} upsamplings after every second"
             )
+        self.kernel = kernel
         self.upsample_after = {2 * (i + 1) - 1 for i in range(upsamplings)}
         self.head = nn.Conv2d(features, channels, 1)
         self.blocks = nn.ModuleList(_Block(channels, kernel) for _ in range(blocks))
         self.image = nn.Conv2d(channels, 3, kernel, padding=kernel // 2, padding_mode="replicate")
         nn.init.zeros_(self.image.weight)
         nn.init.zeros_(self.image.bias)  # type: ignore[arg-type]
+
+    @property
+    def reach(self) -> int:
+        """Feature pixels on each side of its own that a pixel of the image depends on.
+
+        Followed from the pixels of one feature pixel back to the map: a convolution reads kernel // 2 pixels
+        more on each side, a block has two; 2x upsampling makes pixel 2i from i - 1 and i, 2i + 1 from i and i + 1.
+        """
+        margin = self.kernel // 2
+        first, last = -margin, 2 ** len(self.upsample_after) - 1 + margin
+        for index in reversed(range(len(self.blocks))):
+            if index in self.upsample_after:
+                first, last = (first - 1) // 2, (last + 1) // 2
+            first, last = first - 2 * margin, last + 2 * margin
+        return max(-first, last)
 
     def forward(self, feature_map: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 3 height width"]:
         """Images around [0, 1], not clipped: a clipped pixel would have no gradient."""
