@@ -9,15 +9,20 @@ config.json          settings, logs with their scene frames, occupancy grids' pl
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
+from pydantic import BaseModel, FiniteFloat, PositiveFloat
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
+from genassets.driving import CLASSES
 from genassets.errors import StageError
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.scene import SceneFrame
@@ -27,6 +32,26 @@ from genassets.rendering.sampling import OccupancyGrid
 
 FORMAT_VERSION = 1
 LATENTS = ("latent_mean.weight", "latent_log_variance.weight")
+COLUMNS = ("log", "actor_id", "actor_class", "size_l", "size_w", "size_h", "observations")
+
+_Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+
+
+class _LogEntry(BaseModel):
+    """A log in config.json; metres."""
+
+    name: str
+    origin: _Point
+    occupancy_lower: _Point
+    occupancy_cell: PositiveFloat
+
+
+class _Config(BaseModel):
+    """config.json."""
+
+    format_version: int
+    settings: ReconstructionSettings
+    logs: tuple[_LogEntry, ...]
 
 
 @dataclass(frozen=True)
@@ -73,27 +98,27 @@ def save_library(library: AssetLibrary, directory: Path) -> None:
     save_file(latents, directory / "latents.safetensors")
     save_file(weights, directory / "weights.safetensors")
     library.assets.to_parquet(directory / "assets.parquet", index=False)
-    config = {
-        "format_version": FORMAT_VERSION,
-        "settings": library.settings.model_dump(mode="json"),
-        "logs": [
-            {
-                "name": name,
-                "origin": scene.origin.tolist(),
-                "occupancy_lower": library.occupancy[name].lower.tolist(),
-                "occupancy_cell": library.occupancy[name].cell,
-            }
-            for name, scene in library.scenes.items()
-        ],
-    }
-    (directory / "config.json").write_text(json.dumps(config, indent=1), encoding="utf-8")
+    logs = [
+        {
+            "name": name,
+            "origin": scene.origin.tolist(),
+            "occupancy_lower": library.occupancy[name].lower.tolist(),
+            "occupancy_cell": library.occupancy[name].cell,
+        }
+        for name, scene in library.scenes.items()
+    ]
+    config = _Config.model_validate(
+        {"format_version": FORMAT_VERSION, "settings": library.settings, "logs": logs}
+    )
+    (directory / "config.json").write_text(config.model_dump_json(indent=1), encoding="utf-8")
 
 
 def load_library(directory: Path) -> AssetLibrary:
     """Read a library.
 
     Raises:
-        StageError: the directory holds no library, or one of another format version.
+        StageError: the directory holds no library, one of another format version, or a damaged one; names
+            the file, what was expected in it, and what to do.
     """
     path = directory / "config.json"
     if not path.exists():
@@ -101,33 +126,77 @@ def load_library(directory: Path) -> AssetLibrary:
             f"{directory}: no asset library here (config.json is missing); expected the output of the "
             "reconstruct stage. Run it first."
         )
-    config = json.loads(path.read_text(encoding="utf-8"))
-    if config["format_version"] != FORMAT_VERSION:
+    with _reading(path, "the settings and logs of an asset library"):
+        values = json.loads(path.read_text(encoding="utf-8"))
+        version = values["format_version"]
+    if version != FORMAT_VERSION:
         raise StageError(
-            f"{path}: format_version is {config['format_version']}, this release reads {FORMAT_VERSION}; "
+            f"{path}: format_version is {version}, this release reads {FORMAT_VERSION}; "
             "run the reconstruct stage again."
         )
-    settings = ReconstructionSettings.model_validate(config["settings"])
-    assets = pd.read_parquet(directory / "assets.parquet")
-    names = [entry["name"] for entry in config["logs"]]
-    model = build_model(assets, names, settings, seed=0)
-    latents = load_file(directory / "latents.safetensors")
-    weights = load_file(directory / "weights.safetensors")
-    occupancy = {
-        entry["name"]: OccupancyGrid(
-            weights.pop(f"lidar_occupancy.{entry['name']}"),
-            torch.tensor(entry["occupancy_lower"]),
-            entry["occupancy_cell"],
-        )
-        for entry in config["logs"]
-    }
-    codes = (latents["mean"], latents["log_variance"])
-    model.load_state_dict(
-        weights | {n: c.reshape(len(assets), -1) for n, c in zip(LATENTS, codes, strict=True)}
-    )
+    with _reading(path, "the settings and logs of an asset library"):
+        config = _Config.model_validate(values)
+    names = [log.name for log in config.logs]
+    assets = _read_assets(directory / "assets.parquet", names)
+    model = build_model(assets, names, config.settings, seed=0)
+    codes = _read_codes(directory / "latents.safetensors", (len(assets), *model.latent_shape))
+    path = directory / "weights.safetensors"
+    with _reading(path, "the weights of the model that config.json and assets.parquet describe"):
+        weights = load_file(path)
+        occupancy = {
+            log.name: OccupancyGrid(
+                weights.pop(f"lidar_occupancy.{log.name}"),
+                torch.tensor(log.occupancy_lower),
+                log.occupancy_cell,
+            )
+            for log in config.logs
+        }
+        model.load_state_dict(weights | codes)
     model.eval()
-    scenes = {entry["name"]: SceneFrame(entry["name"], np.array(entry["origin"])) for entry in config["logs"]}
-    return AssetLibrary(assets, model, settings, scenes, occupancy)
+    scenes = {log.name: SceneFrame(log.name, np.array(log.origin)) for log in config.logs}
+    return AssetLibrary(assets, model, config.settings, scenes, occupancy)
+
+
+def _read_assets(path: Path, logs: Sequence[str]) -> pd.DataFrame:
+    expected = f"the columns {', '.join(COLUMNS)} and a row an actor of the logs {', '.join(logs)}"
+    with _reading(path, expected):
+        assets = pd.read_parquet(path)
+        if missing := [name for name in COLUMNS if name not in assets]:
+            raise ValueError(f"no column {', '.join(missing)}")
+        for column, valid in (("log", logs), ("actor_class", CLASSES)):
+            if unknown := sorted(set(map(str, assets[column])) - set(valid)):
+                raise ValueError(f"{column} is {', '.join(unknown)}")
+        sizes = assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
+        if not len(sizes) or not (np.isfinite(sizes) & (sizes > 0)).all():
+            raise ValueError("no rows, or a size that is not a positive number")
+    return assets
+
+
+def _read_codes(path: Path, shape: tuple[int, ...]) -> dict[str, Tensor]:
+    """The latents under the names of the model's parameters."""
+    with _reading(path, f"mean and log_variance of shape {shape}, a row a row of assets.parquet"):
+        latents = load_file(path)
+        codes = (latents["mean"], latents["log_variance"])
+        if wrong := [tuple(code.shape) for code in codes if tuple(code.shape) != shape]:
+            raise ValueError(f"the shape is {wrong[0]}")
+    return {name: code.flatten(1) for name, code in zip(LATENTS, codes, strict=True)}
+
+
+@contextmanager
+def _reading(path: Path, expected: str) -> Iterator[None]:
+    """Turn whatever a damaged file of a library raises into one error for people."""
+    try:
+        yield
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError, SafetensorError) as error:
+        why = str(error)
+        if isinstance(error, FileNotFoundError):
+            why = "the file is missing"  # some readers say no more than its path
+        elif isinstance(error, KeyError):
+            why = f"no {error}"
+        raise StageError(
+            f"{path}: cannot be read ({why}); expected {expected}. The library is damaged: remove it and run the "
+            "reconstruct stage again."
+        ) from error
 
 
 def make_library(
