@@ -12,12 +12,14 @@ from numpy.typing import NDArray
 from tiny_log import CAR_SIZE, MOVING, PARKED, WALKER, build_tiny_log
 from tiny_reconstruction import CAMERAS, SETTINGS, STRIDE, Prepared, changed, even
 
-from genassets.driving import Log, open_log
+from genassets.driving import Log, Track, open_log
 from genassets.errors import StageError
 from genassets.geometry.cameras import Intrinsics, project
 from genassets.geometry.transforms import invert_pose, transform_directions
+from genassets.reconstruction.library import make_library
 from genassets.reconstruction.scene import rendered_intrinsics
-from genassets.reconstruction.training_data import draw_batch, prepare_training
+from genassets.reconstruction.scene_renderer import SceneRenderer
+from genassets.reconstruction.training_data import draw_batch, prepare_training, training_frames
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +50,41 @@ def test_actors_that_are_seen_too_small_are_not_learned(log: Log, prepared: Prep
         prepare_training([log], front, even, changed(SETTINGS, smallest_actor=40), STRIDE)
 
 
+def test_an_actor_behind_a_nearer_one_is_not_observed(log: Log) -> None:
+    """A car 4.5 m long hides another 20 m behind it whole, and not one that stands a metre higher."""
+    parked = next(track for track in log.tracks if track.actor_id == PARKED)
+    ahead = parked.world_from_box.copy()
+    ahead[:, :3, 3] = [15.0, 0.0, 0.8]
+    near = replace(parked, actor_id="near", world_from_box=ahead)
+
+    def observed(height: float, *tracks: Track) -> list[str]:
+        poses = ahead.copy()
+        poses[:, :3, 3] += [20.0, 0.0, height]
+        far = replace(parked, actor_id="far", world_from_box=poses)
+        street = replace(log, tracks=(*tracks, far))
+        table, data = prepare_training([street], CAMERAS[:1], even, SETTINGS, STRIDE)
+        assert table["observations"].sum() == len(data[0].observations)
+        return sorted(table["actor_id"])
+
+    assert observed(0.0) == ["far"]
+    assert observed(0.0, near) == ["near"]
+    assert observed(1.0, near) == ["far", "near"]
+
+
+def test_a_log_may_lack_a_camera_but_not_all(log: Log, caplog: pytest.LogCaptureFixture) -> None:
+    assert training_frames(log, ("back_camera", "front_camera"), even) == [
+        ("front_camera", 0),
+        ("front_camera", 2),
+    ]
+    assert "log tiny has no back_camera" in caplog.text
+    for cameras, is_training in ((("back_camera",), even), (CAMERAS, lambda frame: frame == 9)):
+        with pytest.raises(
+            StageError,
+            match="tiny: none of the log's 4 frames has a training .* its cameras are front_camera,",
+        ):
+            training_frames(log, cameras, is_training)
+
+
 def test_only_training_frames_are_read(prepared: Prepared) -> None:
     views = [(view.camera, view.frame) for view in prepared.data[0].views]
     assert views == [(camera, frame) for camera in CAMERAS for frame in (0, 2)]
@@ -60,6 +97,26 @@ def test_a_log_without_lidar_trains_on_images_alone(tmp_path: Path) -> None:
     trainer = Prepared(assets, data).trainer()
     assert trainer.advance().losses.keys() == {"rgb", "kl"}
     assert not data[0].occupancy.cells.any()
+
+
+def test_actors_of_one_frame_are_learned_and_shown_in_that_frame_alone(log: Log) -> None:
+    first = slice(0, 1)
+    tracks = [
+        replace(t, frames=t.frames[first], times=t.times[first], world_from_box=t.world_from_box[first])
+        for t in log.tracks
+    ]
+    brief = replace(log, tracks=tuple(tracks))
+    prepared = Prepared(*prepare_training([brief], CAMERAS[:1], even, SETTINGS, STRIDE))
+    assert set(prepared.assets["observations"]) == {1}
+    trainer = prepared.trainer()
+    assert all(value.isfinite() for value in trainer.advance().losses.values())
+    library = make_library(
+        prepared.assets, trainer.model, SETTINGS, [prepared.data[0].scene], [prepared.data[0].occupancy]
+    )
+    renderer = SceneRenderer(library)
+    assert len(renderer.view(brief, "front_camera", 0).actors.index) == len(prepared.assets)
+    assert len(renderer.view(brief, "front_camera", 1).actors.index) == 0
+    assert np.isfinite(renderer.render_image(brief, "front_camera", 1)).all()
 
 
 def test_a_patch_over_an_actor_contains_it(prepared: Prepared) -> None:

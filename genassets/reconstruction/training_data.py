@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -13,7 +14,9 @@ from torch import Tensor
 
 from genassets.driving import Log
 from genassets.errors import StageError
+from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import pixel_centres
+from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 from genassets.reconstruction.scene import (
     LidarSweepRays,
     SceneFrame,
@@ -28,6 +31,11 @@ from genassets.reconstruction.settings import ReconstructionSettings
 from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import BOX_PADDING, Rays, cast_rays, concatenate_rays
 from genassets.rendering.sampling import OccupancyGrid
+
+logger = logging.getLogger(__name__)
+
+VISIBILITY_RAYS = 24
+"""Rays along each side of a box in the image that tell whether nearer boxes hide it whole."""
 
 LIDAR_SHARE_ON_ACTORS = 0.5
 LIDAR_SHARE_THROUGH_ACTORS = 0.35
@@ -76,14 +84,30 @@ class Batch:
 def training_frames(
     log: Log, cameras: Sequence[str], is_training: Callable[[int], bool]
 ) -> list[tuple[str, int]]:
-    """The (camera, frame) pairs that train: those of the split whose image is there."""
-    return [
+    """The (camera, frame) pairs that train: those of the split whose image is there.
+
+    A log may lack some of the cameras; that is noted in the log file.
+
+    Raises:
+        StageError: no training frame has an image.
+    """
+    absent = [name for name in cameras if name not in log.cameras]
+    if absent:
+        logger.warning("log %s has no %s; it trains on its other cameras", log.name, ", ".join(absent))
+    shots = [
         (name, frame)
         for name in cameras
         if name in log.cameras
         for frame in range(log.frame_count)
         if is_training(frame) and log.cameras[name].image_paths[frame] is not None
     ]
+    if not shots:
+        raise StageError(
+            f"{log.root}: none of the log's {log.frame_count} frames has a training image of "
+            f"{', '.join(cameras)}; its cameras are {', '.join(log.cameras) or 'none'}. "
+            "Name others in split.train_cameras, train on more frames (split.every), or leave the log out."
+        )
+    return shots
 
 
 def prepare_training(
@@ -95,11 +119,12 @@ def prepare_training(
 ) -> tuple[pd.DataFrame, list[TrainingLog]]:
     """The table of learnable actors and, for each log, its views, sweeps and occupancy.
 
-    An actor is learnable once a training view shows it with at least `smallest_actor` pixels. Columns: log,
-    actor_id, actor_class, size_l, size_w, size_h (metres), observations.
+    An actor is learnable once it is observed: a training view shows it with at least `smallest_actor` pixels and
+    nearer boxes don't hide it whole. Columns: log, actor_id, actor_class, size_l, size_w, size_h (metres),
+    observations.
 
     Raises:
-        StageError: no training view shows any actor.
+        StageError: a log has no training image, or no training view shows any actor.
     """
     tables, prepared = [], []
     offset = 0
@@ -108,14 +133,22 @@ def prepare_training(
         everyone = {track.actor_id: number for number, track in enumerate(log.tracks)}
         shots = training_frames(log, cameras, is_training)
         views = [make_view(log, name, f, everyone, scene, settings.image_scale, stride) for name, f in shots]
+        observed = [_observed(view, settings.smallest_actor) for view in views]
         seen = np.zeros(len(log.tracks), dtype=np.int64)
-        for view in views:
-            np.add.at(seen, view.actors.index[_large_enough(view, settings.smallest_actor)], 1)
-        learnable = np.flatnonzero(seen)
-        table = _asset_table(log, learnable, seen)
+        for view, rows in zip(views, observed, strict=True):
+            np.add.at(seen, view.actors.index[rows], 1)
+        table = _asset_table(log, np.flatnonzero(seen), seen)
         index = {actor_id: offset + row for row, actor_id in enumerate(table["actor_id"])}
         tables.append(table)
-        prepared.append(_training_log(log, shots, index, scene, settings, stride, is_training))
+        number_of = np.full(len(log.tracks), -1, dtype=np.int64)
+        number_of[np.flatnonzero(seen)] = list(index.values())
+        observations = [
+            Observation(number, int(number_of[view.actors.index[row]]), tuple(view.bounds[row].tolist()))
+            for number, (view, rows) in enumerate(zip(views, observed, strict=True))
+            for row in rows
+        ]
+        views = [_of_learnable(view, number_of) for view in views]
+        prepared.append(_training_log(log, views, observations, index, scene, settings, is_training))
         offset += len(table)
     assets = pd.concat(tables, ignore_index=True)
     if assets.empty:
@@ -146,19 +179,13 @@ def _asset_table(log: Log, learnable: np.ndarray, seen: np.ndarray) -> pd.DataFr
 
 def _training_log(
     log: Log,
-    shots: Sequence[tuple[str, int]],
+    views: list[View],
+    observations: list[Observation],
     index: Mapping[str, int],
     scene: SceneFrame,
     settings: ReconstructionSettings,
-    stride: int,
     is_training: Callable[[int], bool],
 ) -> TrainingLog:
-    views = [make_view(log, name, f, index, scene, settings.image_scale, stride) for name, f in shots]
-    observations = [
-        Observation(number, int(view.actors.index[row]), tuple(view.bounds[row].tolist()))
-        for number, view in enumerate(views)
-        for row in np.flatnonzero(_large_enough(view, settings.smallest_actor))
-    ]
     render, model = settings.rendering, settings.model
     frames = [frame for frame in range(log.frame_count) if is_training(frame) and log.has_sweep(frame)]
     sweeps = [lidar_rays(log, f, index, scene, render.background_far, BOX_PADDING) for f in frames]
@@ -173,9 +200,53 @@ def _training_log(
     return TrainingLog(scene, views, images, observations, sweeps, occupancy)
 
 
-def _large_enough(view: View, smallest: int) -> np.ndarray:
+def _observed(view: View, smallest: int) -> list[int]:
+    """Rows of the actors whose box's longer side has `smallest` pixels and that nearer boxes don't hide whole."""
     sides = view.bounds[:, 2:] - view.bounds[:, :2]
-    return sides.max(axis=1, initial=0.0) >= smallest
+    large = np.flatnonzero(sides.max(axis=1, initial=0.0) >= smallest)
+    return [row for row in large.tolist() if not _hidden(view, row)]
+
+
+def _hidden(view: View, row: int) -> bool:
+    """Whether every ray to an actor's box has gone through another actor's box before, and left it again."""
+    x0, y0, x1, y1 = view.bounds[row]
+    b = view.bounds
+    others = np.flatnonzero((b[:, 0] < x1) & (b[:, 2] > x0) & (b[:, 1] < y1) & (b[:, 3] > y0))
+    grid = pixel_centres(0, 0, VISIBILITY_RAYS, VISIBILITY_RAYS) / VISIBILITY_RAYS
+    origins, directions = view.rays((x0, y0) + grid * (x1 - x0, y1 - y0))
+    entered = _crossing(view, row, origins, directions)[0]
+    open_rays = np.flatnonzero(np.isfinite(entered))
+    met = len(open_rays)
+    for other in others[others != row].tolist():
+        left = _crossing(view, other, origins[open_rays], directions[open_rays])[1]
+        open_rays = open_rays[~(left <= entered[open_rays])]
+    return met > 0 and len(open_rays) == 0
+
+
+def _crossing(
+    view: View, row: int, origins: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (N,) at which rays enter and leave an actor's box; infinite where they miss it."""
+    box_from_scene = invert_pose(view.actors.scene_from_box[row])
+    near, far = intersect_box(
+        transform_points(box_from_scene, origins),
+        transform_directions(box_from_scene, directions),
+        view.actors.sizes[row],
+    )
+    met = (near < far) & (far > 0)
+    return np.where(met, np.maximum(near, 0.0), np.inf), np.where(met, far, np.inf)
+
+
+def _of_learnable(view: View, number_of: np.ndarray) -> View:
+    """The view of the actors with a number in the library (-1: none), under that number."""
+    keep = number_of[view.actors.index] >= 0
+    actors = view.actors.select(keep)
+    return replace(
+        view,
+        actors=replace(actors, index=number_of[actors.index]),
+        bounds=view.bounds[keep],
+        padded_bounds=view.padded_bounds[keep],
+    )
 
 
 def draw_batch(
