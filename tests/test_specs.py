@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from genassets.driving import CAMERA_NAMES
 from genassets.errors import EnvironmentProblem, SpecError
 from genassets.pipeline.catalog import CATALOG, configs
 from genassets.specs.document import override_document, parse_document, read_document
 from genassets.specs.experiment import Experiment, build_experiment, load_experiment
 from genassets.specs.json_schema import dataset_schema, experiment_schema
-from genassets.specs.split import Split
+from genassets.specs.split import CameraName, Split
 from tests.toy_pipeline import SPEC, TOY_SPECS, TOYS
 
 
@@ -182,3 +184,15 @@ def test_emitted_schemas_are_the_models(tmp_path: Path) -> None:
     for name, schema in (("experiment", experiment_schema(configs(CATALOG))), ("dataset", dataset_schema())):
         written = json.loads((data_specs_root() / "schema" / f"{name}.json").read_text())
         assert written == json.loads(json.dumps(schema)), "run: genassets schema"
+
+
+def test_an_unknown_camera_names_the_nearest() -> None:
+    """Otherwise its images would silently be missing from the training data."""
+    with pytest.raises(SpecError) as error:
+        build(SPEC + "split:\n  train_cameras: [front_camera, front_left]\n  camera: bakc_camera\n")
+    message = str(error.value)
+    assert "toy.yaml:12: split.train_cameras.1 is 'front_left'; expected 'front_camera', " in message
+    assert "did you mean 'front_left_camera'?" in message
+    assert "toy.yaml:13: split.camera is 'bakc_camera'" in message
+    assert "did you mean 'back_camera'?" in message
+    assert get_args(CameraName) == CAMERA_NAMES

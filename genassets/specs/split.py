@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+CameraName = Literal[
+    "front_camera", "front_left_camera", "front_right_camera", "left_camera", "right_camera", "back_camera"
+]
+"""PandaSet's, those of driving.CAMERA_NAMES: stated here, so that reading a spec imports no numpy."""
 
 
 class Split(BaseModel):
@@ -14,10 +21,12 @@ class Split(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    camera: str = Field(default="front_camera", description="Camera whose held-out frames are the test set.")
+    camera: CameraName = Field(
+        default="front_camera", description="Camera whose held-out frames are the test set."
+    )
     every: int = Field(default=2, ge=1, description="One frame in this many trains.")
     offset: int = Field(default=0, ge=0, description="Frame index of the first training frame.")
-    train_cameras: tuple[str, ...] = Field(
+    train_cameras: tuple[CameraName, ...] = Field(
         default=("front_camera",), min_length=1, description="Cameras whose training frames are learned from."
     )
 

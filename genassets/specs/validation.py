@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import typing
 from collections.abc import Iterable
 from typing import Any, TypeVar
@@ -54,6 +55,9 @@ def _message(model: type[BaseModel], detail: Any, document: Document, at: KeyPat
     if detail["type"] in ("value_error", "assertion_error"):
         return f"{where}: {expected}"
     hint = ""
+    if detail["type"] == "literal_error":
+        near = difflib.get_close_matches(str(detail["input"]), re.findall(r"'([^']*)'", expected), n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
     if detail["type"] == "string_type" and isinstance(detail["input"], int | float):
         hint = "; put quotes around a name that looks like a number"
     return f"{where} is {_short(detail['input'])}; expected {expected}{hint}"
