@@ -27,7 +27,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("genassets.fields",),
     ("genassets.driving",),
     ("genassets.geometry", "genassets.weights"),
-    ("genassets.package_archive", "genassets.city_spec"),
+    ("genassets.package_archive", "genassets.city_spec", "genassets.system_libraries"),
     ("genassets.errors",),
 )
 LEVEL = {package: depth for depth, row in enumerate(LAYERS) for package in row}

@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parents[1]
+LIBRARIES = "genassets/system_libraries.py"
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="run is a POSIX shell script")
 
@@ -19,15 +21,21 @@ def checkout(tmp_path: Path) -> Path:
     """A checkout, a space in its path, whose environment is a stand-in that says how it is called."""
     root = tmp_path / "my checkout"
     (root / ".venv" / "bin").mkdir(parents=True)
-    for name in ("run", "pyproject.toml", "constraints.txt"):
-        shutil.copy(REPOSITORY / name, root)
+    (root / "genassets").mkdir()
+    for name in ("run", "pyproject.toml", "constraints.txt", LIBRARIES):
+        shutil.copy(REPOSITORY / name, root / name)
     for name in ("genassets", "python"):
         program = root / ".venv" / "bin" / name
         program.write_text(f'#!/bin/sh\necho "{name} $*"\n')
         program.chmod(0o755)
     # What `run` writes when it has set everything up: it must then leave the environment alone.
     stamp = subprocess.run(
-        ["sh", "-c", '{ echo "$0 cpu"; cat pyproject.toml constraints.txt run; } | cksum', str(root)],
+        [
+            "sh",
+            "-c",
+            f'{{ echo "$0 cpu"; cat pyproject.toml constraints.txt run {LIBRARIES}; }} | cksum',
+            str(root),
+        ],
         cwd=root,
         capture_output=True,
         text=True,
@@ -104,6 +112,21 @@ def test_without_the_right_to_install_the_line_to_type_is_printed(checkout: Path
     finished = call(checkout, "--version", GENASSETS_PYTHON="bare-python", PATH=path)
     assert finished.returncode == 6
     assert finished.stderr.splitlines()[-1].endswith("sudo apt-get install -y python3.11-venv")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere nothing has to be installed")
+def test_the_packages_of_missing_libraries_are_known_before_anything_is_installed(
+    checkout: Path, tmp_path: Path
+) -> None:
+    file = checkout / LIBRARIES
+    file.write_text(file.read_text().replace('"libGL.so.1"', '"libabsent.so.9"'))
+    # -I -S: without this project, its packages and the current directory.
+    finished = subprocess.run(
+        [sys.executable, "-I", "-S", str(file)], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert finished.returncode == 0, finished.stderr
+    assert "libgl1" in finished.stdout.split()
+    assert "setting up" in call(checkout, "--version", GENASSETS_PYTHON="no-such-python").stderr
 
 
 def test_another_build_of_torch_sets_up_again(checkout: Path) -> None:

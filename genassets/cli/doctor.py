@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib
 import json
 import os
@@ -20,18 +19,10 @@ from typing import Annotated, Literal
 import typer
 
 import genassets
-from genassets import weights
+from genassets import system_libraries, weights
 from genassets.errors import EnvironmentProblem
 
 CHECKOUT = Path(genassets.__file__).resolve().parents[1]
-
-SYSTEM_LIBRARIES = {
-    "libusb-1.0.so.0": "libusb-1.0-0",
-    "libGL.so.1": "libgl1",
-    "libX11.so.6": "libx11-6",
-    "libgomp.so.1": "libgomp1",
-}
-"""What open3d loads on Linux, and the Debian package that has it. `run` installs the same ones."""
 
 IMPORTED = ("torch", "open3d", "onnxruntime", "cv2")
 """Packages with compiled parts, which can be installed and still fail to load."""
@@ -84,7 +75,7 @@ def examine() -> Iterator[Finding]:
     yield from _loading()
     yield _torch()
     if sys.platform == "linux":
-        yield from map(_system_library, SYSTEM_LIBRARIES)
+        yield from _system_libraries()
     yield from _pretrained_files()
     yield _npm()
     yield _home()
@@ -158,13 +149,14 @@ def _torch() -> Finding:
     return Finding("torch build", "note", f"CPU, {threads}", cost)
 
 
-def _system_library(library: str) -> Finding:
-    try:
-        ctypes.CDLL(library)
-    except OSError:
-        cost = f"open3d cannot be imported; type: sudo apt-get install -y {SYSTEM_LIBRARIES[library]}"
-        return Finding(library, "missing", "not found", cost)
-    return Finding(library, "ok", "found")
+def _system_libraries() -> Iterator[Finding]:
+    missing = system_libraries.missing()
+    for library, package in system_libraries.DEBIAN_PACKAGES.items():
+        if library in missing:
+            cost = f"open3d cannot be imported; type: sudo apt-get install -y {package}"
+            yield Finding(library, "missing", "not found", cost)
+        else:
+            yield Finding(library, "ok", "found")
 
 
 def _pretrained_files() -> Iterator[Finding]:
