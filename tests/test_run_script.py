@@ -134,6 +134,12 @@ def test_another_build_of_torch_sets_up_again(checkout: Path) -> None:
     assert "setting up" in finished.stderr
 
 
+def test_python_may_keep_its_bytecode_so_that_an_edit_slows_only_the_next_start(checkout: Path) -> None:
+    program = checkout / ".venv" / "bin" / "genassets"
+    program.write_text('#!/bin/sh\necho "${PYTHONDONTWRITEBYTECODE-may write}"\n')
+    assert call(checkout, "plan", PYTHONDONTWRITEBYTECODE="1").stdout == "may write\n"
+
+
 def test_a_shell_finds_the_environment(checkout: Path) -> None:
     finished = call(checkout, "shell", "-c", "command -v genassets; echo $VIRTUAL_ENV", SHELL="/bin/sh")
     assert finished.stdout.splitlines() == [
