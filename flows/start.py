@@ -15,6 +15,7 @@ from genassets.cli.launch import RunRequest, load_workflow
 from genassets.errors import EnvironmentProblem
 from genassets.pipeline.atomic_write import write_text
 from genassets.pipeline.home import Home
+from genassets.pipeline.preflight import check_pretrained_files
 from genassets.pipeline.run_record import RunRecord, new_run_directory
 
 

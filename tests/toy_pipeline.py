@@ -134,11 +134,15 @@ TOYS = (NUMBERS, TOTAL, REPORT)
 
 
 def toy_workflow(
-    home: Path, overrides: Sequence[str] = (), selection: Selection = Selection(), spec: str = SPEC
+    home: Path,
+    overrides: Sequence[str] = (),
+    selection: Selection = Selection(),
+    spec: str = SPEC,
+    stages: Sequence[Stage] = TOYS,
 ) -> Workflow:
     """The toy experiment with overrides, its store below ``home``."""
-    experiment = build_experiment(parse_document(spec, "toy.yaml"), configs(TOYS), overrides, TOY_SPECS)
-    return Workflow(experiment, TOYS, Home(home), selection)
+    experiment = build_experiment(parse_document(spec, "toy.yaml"), configs(stages), overrides, TOY_SPECS)
+    return Workflow(experiment, stages, Home(home), selection)
 
 
 def start_record(workflow: Workflow) -> RunRecord:
@@ -155,9 +159,10 @@ def run_toy(
     selection: Selection = Selection(),
     listeners: Sequence[RunListener] = (),
     engine: Engine = run_inline,
+    stages: Sequence[Stage] = TOYS,
 ) -> tuple[int, RunRecord]:
     """Run the toy experiment; the exit code and the record."""
-    workflow = toy_workflow(home, overrides, selection)
+    workflow = toy_workflow(home, overrides, selection, stages=stages)
     record = start_record(workflow)
     return execute(workflow, record, listeners, engine), record
 

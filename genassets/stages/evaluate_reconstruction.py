@@ -265,6 +265,11 @@ def _picture_whole_frames(
         )
 
 
+def needed_files(config: EvaluateReconstructionConfig) -> dict[str, str]:
+    """The pinned files that the evaluation cannot do without."""
+    return {"lpips-alexnet": "evaluate_reconstruction.lpips=false"} if config.lpips else {}
+
+
 STAGE = Stage(
     name="evaluate_reconstruction",
     version=1,
@@ -285,4 +290,5 @@ STAGE = Stage(
     run=run,
     sharded=False,
     summary="Compare held-out views of every actor with renders and with two trivial baselines.",
+    pretrained=needed_files,
 )

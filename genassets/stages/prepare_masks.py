@@ -304,6 +304,13 @@ def pretrained_files(config: PrepareMasksConfig) -> dict[str, str]:
     return {name: weights.status(name).state for name in ("sam-encoder", "sam-decoder")}
 
 
+def needed_files(config: PrepareMasksConfig) -> dict[str, str]:
+    """The pinned files that the masks cannot do without: "auto" has GrabCut to fall back on."""
+    if config.segmenter != "sam" or config.encoder is not None:
+        return {}
+    return dict.fromkeys(("sam-encoder", "sam-decoder"), "prepare_masks.segmenter=grabcut")
+
+
 STAGE = Stage(
     name="prepare_masks",
     version=1,
@@ -322,4 +329,5 @@ STAGE = Stage(
     summary="the object table, with masks where they are asked for",
     runtime_only=frozenset({"threads"}),
     reads=pretrained_files,
+    pretrained=needed_files,
 )

@@ -77,7 +77,7 @@ class Inputs:
         return self.objects[stage]
 
 
-def _reads_nothing(config: Any) -> Mapping[str, str]:
+def _nothing(config: Any) -> Mapping[str, str]:
     """What a stage that reads only its inputs reads besides them."""
     return {}
 
@@ -129,6 +129,8 @@ class Stage:
             stages that read this one don't run again.
         reads: digests of what the result depends on besides inputs, config and code, by name: the
             pretrained files, say. Files and logs that the config names are digested anyway.
+        pretrained: pretrained files without which the stage cannot run with a config, each with the
+            setting (as for --set) that does without; a run checks them before its first stage.
         sharded: one output per log of the dataset instead of one over all.
     """
 
@@ -142,4 +144,5 @@ class Stage:
     summary: str
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()
-    reads: Callable[[Any], Mapping[str, str]] = field(default=_reads_nothing)
+    reads: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
+    pretrained: Callable[[Any], Mapping[str, str]] = field(default=_nothing)

@@ -1,0 +1,36 @@
+"""What a run needs from the machine, checked before any of its work."""
+
+from __future__ import annotations
+
+from genassets import weights
+from genassets.errors import WeightsError
+from genassets.pipeline.plan import Workflow, make_plan
+
+
+def check_pretrained_files(workflow: Workflow) -> None:
+    """Check the pretrained files of all stages that have to run.
+
+    Raises:
+        WeightsError: one is missing or altered; names file, digest, stage and the setting that does without.
+    """
+    lacking = {
+        stage.name: [
+            f"stage {stage.name}: {found.problem()} To run without it: --set {setting}"
+            for name, setting in stage.pretrained(config).items()
+            if (found := weights.status(name)).state != "valid"
+        ]
+        for stage in workflow.stages
+        for config in [workflow.experiment.config(stage.name, workflow.shards[0])]
+    }
+    if not any(lacking.values()):
+        return  # so that the plan, which reads every file of a new log, is made once
+    only = workflow.selection.only
+    running = {item.step.stage.name for item in make_plan(workflow) if item.action == "run"}
+    problems = [
+        problem
+        for stage, found in lacking.items()
+        if stage in running and only in (None, stage)
+        for problem in found
+    ]
+    if problems:
+        raise WeightsError("\n".join(problems))
