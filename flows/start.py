@@ -44,10 +44,12 @@ def run_flow(request: RunRequest) -> RunRecord:
     """Run an experiment through Prefect in this process and return its record.
 
     Raises:
-        SpecError: before Prefect is started.
+        SpecError, WeightsError: before Prefect is started.
         EnvironmentProblem: Prefect itself failed.
     """
     workflow = load_workflow(request)
+    workflow.pin_code()
+    check_pretrained_files(workflow)
     directory = new_run_directory(workflow.home.runs, workflow.experiment.header.name)
     prepare_environment(workflow.home)
     print(

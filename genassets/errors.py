@@ -26,6 +26,10 @@ class StageError(GenAssetsError):
     exit_code = 3
 
 
+class CodeChanged(StageError):
+    """The source was edited while a run was going, so what it makes would be of no one version."""
+
+
 class LogError(GenAssetsError):
     """A driving log is missing, incomplete or malformed."""
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from genassets.errors import StageError
@@ -35,6 +35,29 @@ def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> di
         roots: dotted names of modules or packages.
         source_root: directory that holds the package's directory.
     """
+    return code_trees([tuple(roots)], source_root, memory)[tuple(roots)]
+
+
+def code_trees(
+    all_roots: Iterable[tuple[str, ...]], source_root: Path, memory: FileMemory
+) -> dict[tuple[str, ...], dict[str, str]]:
+    """As ``code_tree`` for several roots, by root; modules that they share are looked at once."""
+    looked: dict[str, tuple[str, list[str]] | None] = {}
+
+    def look(name: str) -> tuple[str, list[str]] | None:
+        if name not in looked:
+            path = module_file(name, source_root)
+            looked[name] = (
+                None
+                if path is None
+                else memory.of(path, _digest_and_imports(name, path.name == "__init__.py"))
+            )
+        return looked[name]
+
+    return {roots: _reached(roots, look) for roots in all_roots}
+
+
+def _reached(roots: Sequence[str], look: Callable[[str], tuple[str, list[str]] | None]) -> dict[str, str]:
     digests: dict[str, str] = {}
     waiting = list(roots)
     seen: set[str] = set()
@@ -43,12 +66,9 @@ def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> di
         if name in seen:
             continue
         seen.add(name)
-        path = module_file(name, source_root)
-        if path is None:
-            continue
-        digest, imported = memory.of(path, _digest_and_imports(name, path.name == "__init__.py"))
-        if name not in WITHOUT_EFFECT:
-            digests[name] = digest
+        found = look(name)
+        if found is not None and name not in WITHOUT_EFFECT:
+            digests[name], imported = found
             waiting.extend(imported)
             # Importing a.b.c runs a/__init__.py and a/b/__init__.py as well.
             parts = name.split(".")

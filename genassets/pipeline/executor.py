@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from genassets.errors import GenAssetsError, StageError
+from genassets.errors import CodeChanged, GenAssetsError, StageError
 from genassets.pipeline.fingerprint import fingerprint
 from genassets.pipeline.plan import Step, Workflow
 from genassets.pipeline.run_record import METRICS_FILE, RunRecord, StepRecord, read_metrics, write_metrics
@@ -68,6 +68,7 @@ def perform(
         inputs: the objects that the step reads, by stage and shard.
 
     Raises:
+        CodeChanged: the stage's source is no longer what the fingerprint says; nothing is stored.
         GenAssetsError: the stage, the lock or the disk failed.
     """
     store = workflow.store
@@ -84,6 +85,7 @@ def perform(
         found = store.find(name, digest)
         if found is not None and not step.forced:
             return Outcome(found, cached=True)
+        workflow.check_code(step.stage)
         if step.forced:
             store.clear_work(name, digest)
         with store.creating(name, digest) as out:
@@ -103,6 +105,11 @@ def perform(
             started = time.monotonic()
             metrics = step.stage.run(Inputs(paths), config, out, context)
             seconds = time.monotonic() - started
+            try:
+                workflow.check_code(step.stage)
+            except CodeChanged:
+                store.clear_work(name, digest)  # its checkpoints may be of the edited code
+                raise
             _write_results(step, out, metrics, curves)
             made = store.commit(out, name, step.shard, digest, tree, seconds, step.stage.location_files)
         store.clear_work(name, digest)
@@ -153,14 +160,18 @@ def execute(
 ) -> int:
     """Run every step in order and keep the record true; returns the exit code.
 
-    A failed step lets steps that don't read it go on. Ctrl-C stops at once, with nothing half written.
+    A failed step lets steps that don't read it go on. Ctrl-C stops at once, with nothing half written, and
+    so does a change of the code.
     """
+    workflow.pin_code()
     run = _Run(workflow, record, listeners, engine)
     for listener in listeners:
         listener.run_started(record, workflow)
     try:
         for step in workflow.steps():
             run.step(step)
+            if run.code_changed:
+                break
     except KeyboardInterrupt:
         record.status = "interrupted"
         record.error = "interrupted by the user"
@@ -185,6 +196,7 @@ class _Run:
         self._engine = engine
         self._done: dict[str, StoredObject] = {}
         self._codes: list[int] = []
+        self.code_changed = False
 
     def step(self, step: Step) -> None:
         """Run one step and record what became of it."""
@@ -225,6 +237,7 @@ class _Run:
             raise
         except Exception as error:
             known = isinstance(error, GenAssetsError)
+            self.code_changed = isinstance(error, CodeChanged)
             record.status = "failed"
             record.error = str(error) if known else f"{type(error).__name__}: {error}"
             record.seconds = time.monotonic() - started
@@ -282,7 +295,9 @@ class _Run:
         counts = {step.name: sum(other.name == step.name for other in self._record.stages) for step in failed}
         lost = {name: sum(step.name == name for step in failed) / count for name, count in counts.items()}
         allowed = self._workflow.experiment.header.allowed_failed_shards
-        return "partly_failed" if whole and max(lost.values()) <= allowed else "failed"
+        return (
+            "partly_failed" if whole and not self.code_changed and max(lost.values()) <= allowed else "failed"
+        )
 
     def exit_code(self) -> int:
         """Exit code for the run's status."""

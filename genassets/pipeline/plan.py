@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genassets.errors import SpecError
+from genassets.errors import CodeChanged, SpecError
 from genassets.pipeline.catalog import dependents, wanted_stages
-from genassets.pipeline.code_digest import code_tree
+from genassets.pipeline.code_digest import code_trees
 from genassets.pipeline.file_digests import FileMemory, sha256_of
 from genassets.pipeline.fingerprint import components, differences, fingerprint
 from genassets.pipeline.home import Home
@@ -21,6 +20,10 @@ from genassets.specs.log_source import PandasetSource
 from genassets.stages.stage import Stage
 
 CODE_MEMORY = "code.json"
+SOURCE_ROOT = Path(__file__).parents[2]
+
+_CODE_OF_PROCESS: dict[tuple[str, ...], dict[str, str]] = {}
+"""Code by roots as this process first saw it: what it has imported stays, whatever becomes of the files."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,6 @@ class Workflow:
         self.store = Store(home.store)
         self.selection = selection
         self.stages = self._selected(tuple(catalog))
-        self._code: dict[str, dict[str, str]] = {}
         self._logs: dict[str, str] = {}
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
@@ -105,7 +107,7 @@ class Workflow:
             forced = dependents(self.stages, self.selection.start_from)
         if self.selection.only is not None:
             forced = {self.selection.only}
-        return [
+        steps = [
             Step(stage, shard, stage.name in forced)
             for stage in self.stages
             for shard in (self.shards if stage.sharded else (None,))
@@ -133,20 +135,40 @@ class Workflow:
             step.shard,
             self.experiment.config(step.stage.name, step.shard),
             contents,
-            self._code_of(step.stage),
+            self.code_of(step.stage),
             self.experiment.header.seed,
             self._sources_of(step),
         )
 
-    def _code_of(self, stage: Stage) -> dict[str, str]:
-        if stage.name not in self._code:
-            module = inspect.getmodule(stage.run)
-            assert module is not None
-            with FileMemory(self.home.cache / CODE_MEMORY) as memory:
-                source_root = Path(__file__).parents[2]
-                tree = code_tree([module.__name__, *stage.modules], source_root, memory)
-            self._code[stage.name] = tree
-        return self._code[stage.name]
+    def pin_code(self) -> None:
+        """Digest the code of every stage now, before a long run gives anyone time to edit it."""
+        new = {_code_roots(stage) for stage in self.stages} - _CODE_OF_PROCESS.keys()
+        if new:
+            _CODE_OF_PROCESS.update(self._code_on_disk(new))
+
+    def code_of(self, stage: Stage) -> dict[str, str]:
+        """Digests of a stage's modules as they were when this process first asked for them."""
+        self.pin_code()
+        return _CODE_OF_PROCESS[_code_roots(stage)]
+
+    def check_code(self, stage: Stage) -> None:
+        """Raise CodeChanged when a stage's modules on disk are other than those that its fingerprint names.
+
+        Stages import when they run, so an edit would mix old modules with new ones.
+        """
+        roots = _code_roots(stage)
+        now = self._code_on_disk([roots])[roots]
+        changed = [name for name, _, _ in differences(self.code_of(stage), now)]
+        if changed:
+            shown = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+            raise CodeChanged(
+                f"the code changed while the run was going: {shown} (below {SOURCE_ROOT}) is not what stage "
+                f"{stage.name} was planned with, so nothing of it is stored; start it again: genassets resume"
+            )
+
+    def _code_on_disk(self, roots: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], dict[str, str]]:
+        with FileMemory(self.home.cache / CODE_MEMORY) as memory:
+            return code_trees(roots, SOURCE_ROOT, memory)
 
     def _sources_of(self, step: Step) -> dict[str, str]:
         """Digests of what a step reads from outside the store: its log's files, files that its config names."""
@@ -168,6 +190,10 @@ class Workflow:
             with FileMemory(self.home.cache / "sources" / f"log-{source.name}.json") as memory:
                 self._logs[source.name] = source_digest(source.root / source.name, memory)
         return self._logs[source.name]
+
+
+def _code_roots(stage: Stage) -> tuple[str, ...]:
+    return (stage.run.__module__, *stage.modules)
 
 
 def make_plan(workflow: Workflow) -> list[PlannedStep]:
