@@ -21,6 +21,7 @@ def experiment(
     only: str | None = None,
     track: bool = True,
     run_id: str | None = None,
+    resumes: str | None = None,
 ) -> Any:
     """Run an experiment by the name or path of its spec.
 
@@ -30,8 +31,9 @@ def experiment(
         only: run nothing but this stage.
         track: record the run in MLflow.
         run_id: directory of the run below runs/, already made; a new one by default.
+        resumes: id of the earlier run to go on with; its record says which stages.
     """
-    request = RunRequest(spec, tuple(overrides or ()), start_from, only, "prefect", track)
+    request = RunRequest(spec, tuple(overrides or ()), start_from, only, "prefect", track, resumes)
     prepared = prepare(request, run_id)
     with ProgressDisplay() as display:
         code = launch(prepared, [display], run_as_task)

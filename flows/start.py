@@ -67,6 +67,7 @@ def run_flow(request: RunRequest) -> RunRecord:
             only=request.only,
             track=request.track,
             run_id=directory.name,
+            resumes=request.resumes,
             return_state=True,
         )
         record = RunRecord.load(directory)

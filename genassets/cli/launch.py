@@ -36,7 +36,10 @@ LOG_FILE = "run.log"
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What a person asked for: a spec by name or path, overrides, and which stages."""
+    """What a person asked for: a spec by name or path, overrides, and which stages.
+
+    ``resumes`` is the id of the run to go on with; its record says which stages.
+    """
 
     spec: str
     overrides: tuple[str, ...] = ()
@@ -44,6 +47,7 @@ class RunRequest:
     only: str | None = None
     engine: str = "inline"
     track: bool = True
+    resumes: str | None = None
 
 
 @dataclass(frozen=True)
@@ -58,10 +62,19 @@ class PreparedRun:
 def load_workflow(request: RunRequest) -> Workflow:
     """The workflow of a request; spec errors are raised here."""
     experiment = load_experiment(request.spec, configs(CATALOG), request.overrides)
-    selection = Selection(request.start_from, request.only)
     if request.start_from is not None and request.only is not None:
         raise SpecError("--from and --only contradict each other; give one of them")
-    return Workflow(experiment, CATALOG, Home.from_environment(), selection)
+    home = Home.from_environment()
+    return Workflow(experiment, CATALOG, home, _selection(request, home.runs))
+
+
+def _selection(request: RunRequest, runs: Path) -> Selection:
+    if request.resumes is None:
+        return Selection(request.start_from, request.only)
+    record = RunRecord.load(runs / request.resumes)
+    made = frozenset(step.key for step in record.stages if step.status == "completed")
+    begun = frozenset(step.key for step in record.stages if step.status not in ("pending", "skipped"))
+    return Selection(record.start_from, record.only, made, begun)
 
 
 def load_resolved(run_directory: Path) -> Experiment:
@@ -89,6 +102,8 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         engine=request.engine,
         started=time.time(),
         stages=[StepRecord(step.stage.name, step.shard) for step in workflow.steps()],
+        start_from=workflow.selection.start_from,
+        only=workflow.selection.only,
     )
     record.save()
     return PreparedRun(request, workflow, record)
@@ -149,9 +164,9 @@ class ReportWriter:
 
 
 def resume_request(run: str | None, engine: str, track: bool) -> RunRequest:
-    """The request that repeats a run with its resolved spec."""
+    """The request that goes on with a run: its resolved spec, its --from or --only, what it did not finish."""
     directory = find_run(Home.from_environment().runs, run)
-    return RunRequest(spec=str(directory / SPEC_FILE), engine=engine, track=track)
+    return RunRequest(str(directory / SPEC_FILE), engine=engine, track=track, resumes=directory.name)
 
 
 def _log_to(path: Path) -> logging.Handler:

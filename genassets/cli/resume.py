@@ -1,4 +1,4 @@
-"""`genassets resume`: run an earlier run's resolved spec again; finished stages come from the store."""
+"""`genassets resume`: run an earlier run's resolved spec and selection again; finished stages come from the store."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def resume(
     as_json: AsJson = False,
     track: Track = True,
 ) -> None:
-    """Go on with a run that failed or was interrupted, with exactly its spec."""
+    """Go on with a run that failed or was interrupted, with exactly its spec and its --from or --only."""
     from genassets.cli.launch import resume_request
 
     run_request(resume_request(run, engine, track), as_json)

@@ -86,7 +86,7 @@ def perform(
         if found is not None and not step.forced:
             return Outcome(found, cached=True)
         workflow.check_code(step.stage)
-        if step.forced:
+        if step.forced and step.key not in workflow.selection.begun:
             store.clear_work(name, digest)
         with store.creating(name, digest) as out:
             work_dir = store.work_dir(name, digest)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,14 @@ class Selection:
     """Which stages have to run again, or alone.
 
     ``start_from``: that stage and what hangs on it run even where the store has them. ``only``: nothing but
-    that stage; what it needs has to be in the store.
+    that stage; what it needs has to be in the store. Of a run that is resumed, ``made`` are the keys of the
+    steps that it completed, which need not be made again, and ``begun`` those whose checkpoints are its own.
     """
 
     start_from: str | None = None
     only: str | None = None
+    made: frozenset[str] = frozenset()
+    begun: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,7 @@ class Workflow:
             for stage in self.stages
             for shard in (self.shards if stage.sharded else (None,))
         ]
+        return [replace(step, forced=False) if step.key in self.selection.made else step for step in steps]
 
     def needed_keys(self, step: Step) -> dict[str, dict[str, str]]:
         """Keys of the steps that a step reads, by stage and shard ("" for a stage without shards)."""

@@ -63,6 +63,8 @@ class RunRecord:
     error: str | None = None
     report: str | None = None
     mlflow_run_id: str | None = None
+    start_from: str | None = None
+    only: str | None = None
 
     def step(self, key: str) -> StepRecord:
         """The record of a step by its key."""
