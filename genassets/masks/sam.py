@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from genassets.errors import WeightsError
 from genassets.masks.crops import CropSettings, Placement, plan_inputs
+from genassets.masks.outlines import inside_outline
 from genassets.masks.segmenter import Prompt
 
 PIXEL_MEAN = np.array([123.675, 116.28, 103.53], np.float32)  # ImageNet's, RGB 0..255, as in SAM
@@ -40,8 +41,8 @@ class SamSegmenter:
     """SAM-style segmenter on crops around the boxes.
 
     encoder_path, decoder_path: the ONNX pair. label: what the object table calls it ("sam" and a digest).
-    bounds_padding: pixels outside the box's bounds, widened by this fraction of its sides, never belong to
-    it.
+    outline_margin_px, outline_margin: pixels farther outside the box's outline than this, or than this
+    fraction of its longer side, never belong to it.
     lidar_points: how many of the actor's returns are given besides the box, as points on the object. The
     paper prompts with the box alone, which also keeps the LiDAR test independent of the mask.
     threads: of onnxruntime; None is every core. The masks do not depend on it beyond rounding.
@@ -56,13 +57,15 @@ class SamSegmenter:
         decoder_path: Path,
         label: str = "sam",
         crops: CropSettings | None = None,
-        bounds_padding: float = 0.05,
+        outline_margin_px: float = 1.0,
+        outline_margin: float = 0.02,
         lidar_points: int = 0,
         threads: int | None = None,
     ) -> None:
         self.name = label
         self._crops = crops or CropSettings()
-        self._bounds_padding = bounds_padding
+        self._outline_margin_px = outline_margin_px
+        self._outline_margin = outline_margin
         self._lidar_points = lidar_points
         threads = threads or os.cpu_count() or 1
         self._encoder = _open_model(encoder_path, threads)
@@ -82,11 +85,11 @@ class SamSegmenter:
                 x0, y0, x1, y1 = placement.crop.region
                 for index in placement.crop.prompts:
                     logits = self._decode(embedding, placement, prompts[index])
-                    allowed = _widened(boxes[index], self._bounds_padding, width, height)
-                    found = masks[index]
-                    found[y0:y1, x0:x1] = logits > 0
-                    found[: allowed[1]] = found[allowed[3] :] = False
-                    found[:, : allowed[0]] = found[:, allowed[2] :] = False
+                    left, top, right, bottom = boxes[index]
+                    longer = max(right - left, bottom - top)
+                    margin = max(self._outline_margin_px, self._outline_margin * longer)
+                    masks[index][y0:y1, x0:x1] = logits > 0
+                    masks[index] &= inside_outline(prompts[index].hull, width, height, margin)
         return masks
 
     def _encode(self, image: NDArray[np.uint8], placements: Sequence[Placement]) -> NDArray[np.float32]:
@@ -193,17 +196,3 @@ def _check_decoder(session: Any, path: Path) -> None:
             f"{path}: inputs {sorted(names)} and outputs {sorted(outputs)}; expected the prompt decoder of "
             f"SAM's ONNX export with {', '.join(DECODER_INPUTS)} and {LOW_RESOLUTION}."
         )
-
-
-def _widened(
-    bounds: tuple[float, float, float, float], fraction: float, width: int, height: int
-) -> tuple[int, int, int, int]:
-    """Whole pixels touched by the bounds after each side moved out by a fraction of the box's extent."""
-    x0, y0, x1, y1 = bounds
-    dx, dy = fraction * (x1 - x0), fraction * (y1 - y0)
-    return (
-        max(0, int(np.floor(x0 - dx))),
-        max(0, int(np.floor(y0 - dy))),
-        min(width, int(np.ceil(x1 + dx))),
-        min(height, int(np.ceil(y1 + dy))),
-    )
