@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from genassets.fields.asset_decoder import AssetDecoder
+from genassets.fields.asset_decoder import AssetDecoder, PatchPath
 from genassets.fields.background import contract
 from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import Sharpness, log_transmittance
@@ -122,3 +122,19 @@ def test_paper_decoder_has_the_papers_shapes() -> None:
         assert decoder(code, code).shape == (1, 3, 12, 128, 128)
     norm = decoder.blocks[0].get_submodule("norm1")
     assert isinstance(norm, torch.nn.GroupNorm) and norm.num_groups == 32
+
+
+@pytest.mark.parametrize("scale", [1, 2, 8])
+def test_a_cell_of_the_code_reaches_its_patch_and_its_neighbours_patches(scale: int) -> None:
+    path = PatchPath(4, 6, 3, scale)
+    code = torch.zeros(1, 4, 8, 8)
+    moved = code.clone()
+    moved[0, :, 3, 5] = 1
+    with torch.no_grad():
+        change = (path(moved) - path(code)).abs().sum(dim=(0, 1))
+    assert change.shape == (8 * scale, 8 * scale)
+    rows, columns = torch.nonzero(change.sum(1))[:, 0], torch.nonzero(change.sum(0))[:, 0]
+    # Hidden cells 2 to 4 and 4 to 6 see the change; their patches reach half a cell further.
+    reach = scale // 2
+    assert rows.min() == 2 * scale - reach and rows.max() == 5 * scale - 1 + reach
+    assert columns.min() == 4 * scale - reach and columns.max() == 7 * scale - 1 + reach

@@ -49,18 +49,45 @@ class NonLocalBlock(nn.Module):
         return x + self.project(attended.transpose(-1, -2).reshape(n, c, h, w))
 
 
+class PatchPath(nn.Module):
+    """From each cell of a small map to a patch of texels that overlaps its neighbours' by half.
+
+    One hidden layer beside the map itself, no normalisation. A code of 8 x 8 reaches any texel through two
+    layers; deep paths of upsamplings need many more steps to carry detail that far.
+    """
+
+    def __init__(self, channels_in: int, hidden: int, channels_out: int, scale: int) -> None:
+        super().__init__()
+        self.hidden = nn.Conv2d(channels_in, hidden, 3, padding=1)
+        side = 2 * scale if scale > 1 else 1
+        self.patches = nn.ConvTranspose2d(
+            channels_in + hidden, channels_out, side, stride=scale, padding=(side - scale) // 2
+        )
+        ramp = 1 - (2 * (torch.arange(side) + 0.5) / side - 1).abs()
+        with torch.no_grad():  # patches fade out, so that an untrained plane has no seams
+            self.patches.weight.mul_(side / 4 * ramp[:, None] * ramp)
+
+    def forward(self, x: Float[Tensor, "n cin h w"]) -> Float[Tensor, "n cout height width"]:
+        return self.patches(torch.cat((x, F.silu(self.hidden(x))), dim=1))
+
+
 class AssetDecoder(nn.Module):
     """Latent code and class embedding to triplanes (paper, "Asset Decoder").
 
     Residual, non-local and residual block at the latent's resolution, then one residual block for each
     entry of channels, with a 2x upsampling before each but the first. The paper: 8 x 8 x 32 latents,
-    channels 256, 128, 128, 64, 64, planes of 128 x 128 x 12. Beside them, unlike the paper, a linear path lays
-    code and embedding themselves, enlarged, under the planes: it carries an actor's paint past the
-    normalisations, and codes learn through it in few steps.
+    channels 256, 128, 128, 64, 64, planes of 128 x 128 x 12. Beside them, unlike the paper, a shallow path of
+    patch_channels hidden channels adds to the planes: it carries an actor's paint past the normalisations,
+    and codes learn detail through it in few steps. With 0 it is left out.
     """
 
     def __init__(
-        self, latent_channels: int, channels: Sequence[int], plane_channels: int, groups: int = 32
+        self,
+        latent_channels: int,
+        channels: Sequence[int],
+        plane_channels: int,
+        groups: int = 32,
+        patch_channels: int = 0,
     ) -> None:
         super().__init__()
         width = channels[0]
@@ -75,19 +102,24 @@ class AssetDecoder(nn.Module):
         self.blocks = nn.ModuleList(ResidualBlock(cin, cout, groups) for cin, cout in pairs)
         self.norm = nn.GroupNorm(_groups(groups, channels[-1]), channels[-1])
         self.planes = nn.Conv2d(channels[-1], 3 * plane_channels, 3, padding=1)
-        self.coarse = nn.Conv2d(2 * latent_channels, 3 * plane_channels, 1)
+        scale = 2 ** (len(channels) - 1)
+        self.patches = (
+            PatchPath(2 * latent_channels, patch_channels, 3 * plane_channels, scale)
+            if patch_channels
+            else None
+        )
 
     def forward(
         self, latent: Float[Tensor, "n c h w"], embedding: Float[Tensor, "n c h w"]
     ) -> Float[Tensor, "n 3 channels height width"]:
         """Decode n actors; height = h x 2^(number of blocks - 1)."""
-        x = torch.cat((latent, embedding), dim=1).contiguous(memory_format=torch.channels_last)
-        coarse = self.coarse(x)
-        x = self.middle(self.head(x))
+        code = torch.cat((latent, embedding), dim=1).contiguous(memory_format=torch.channels_last)
+        x = self.middle(self.head(code))
         for index, block in enumerate(self.blocks):
             x = block(F.interpolate(x, scale_factor=2, mode="nearest") if index else x)
         planes = self.planes(F.silu(self.norm(x)))
-        planes = planes + F.interpolate(coarse, planes.shape[-2:], mode="bilinear", align_corners=False)
+        if self.patches is not None:
+            planes = planes + self.patches(code)
         return planes.reshape(len(planes), 3, self.plane_channels, *planes.shape[-2:])
 
 

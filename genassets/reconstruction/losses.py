@@ -26,6 +26,22 @@ def lidar_loss(
     return residual.topk(kept, largest=False).values.mean()
 
 
+def surface_loss(
+    on_surface: Float[Tensor, " returns"],
+    in_free_space: Float[Tensor, " free"],
+    clearance: Float[Tensor, " free"],
+    trim: float,
+) -> Float[Tensor, ""]:
+    """How far signed distances in metres are from what LiDAR says: zero at returns, positive before them.
+
+    The mean absolute distance at returns, without the largest `trim` share, plus the mean shortfall from
+    `clearance` in free space.
+    """
+    at_returns = lidar_loss(on_surface, torch.zeros_like(on_surface), trim)
+    shortfall = (clearance - in_free_space).clamp(min=0)
+    return at_returns + shortfall.sum() / max(len(shortfall), 1)
+
+
 def kl_loss(mean: Float[Tensor, "n c h w"], log_variance: Float[Tensor, "n c h w"]) -> Float[Tensor, ""]:
     """KL divergence of the codes from a standard normal, averaged over their entries.
 

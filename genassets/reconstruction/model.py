@@ -68,6 +68,7 @@ class AssetModel(nn.Module):
                 settings.decoder_channels,
                 settings.plane_channels,
                 settings.decoder_groups,
+                settings.decoder_patch_channels,
             )
             self.field = FeatureField(3 * settings.plane_channels, settings.field_hidden, settings.features)
             self.background_field = FeatureField(

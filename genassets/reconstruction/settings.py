@@ -22,6 +22,9 @@ class ModelSettings(_Settings):
     latent_channels: PositiveInt = 32
     decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)
     decoder_groups: PositiveInt = Field(default=32, description="groups of group normalisation, at most")
+    decoder_patch_channels: Annotated[int, Field(ge=0)] = Field(
+        default=128, description="width of the decoder's shallow path from code to plane; 0 leaves it out"
+    )
     plane_channels: PositiveInt = 8
     field_hidden: PositiveInt = 48
     sharpness: PositiveFloat = Field(default=20.0, description="beta at the start, in 1/m")
@@ -70,7 +73,7 @@ class LearningRates(_Settings):
     """Adam's rates at the start; all fall along a half cosine to `final` times their start."""
 
     latent: PositiveFloat = 0.1
-    decoder: PositiveFloat = 2e-3
+    decoder: PositiveFloat = 4e-3
     field: PositiveFloat = 5e-3
     sharpness: PositiveFloat = 0.05
     background: PositiveFloat = 5e-2
@@ -83,6 +86,7 @@ class LossWeights(_Settings):
 
     rgb: Weight = 1.0
     lidar: Weight = 0.01
+    surface: Weight = 0.05
     kl: Weight = 1e-5
 
 
@@ -93,13 +97,13 @@ class ReconstructionSettings(_Settings):
         default=0.25, description="size of rendered images as a share of the log's images"
     )
     steps: PositiveInt = 1500
-    patches: PositiveInt = 4
+    patches: PositiveInt = 16
     views_at_once: PositiveInt = Field(default=2, description="views that the patches of a step come from")
     decoded_actors: PositiveInt = Field(
         default=12,
         description="actors decoded and learned in a step; others that rays meet keep the planes they had",
     )
-    patch_size: PositiveInt = Field(default=32, description="side of a training patch in feature pixels")
+    patch_size: PositiveInt = Field(default=16, description="side of a training patch in feature pixels")
     patch_margin: Annotated[int, Field(ge=0)] = Field(
         default=2,
         description="feature pixels rendered around a patch as context for the image network. A trade-off: fewer "
@@ -112,6 +116,9 @@ class ReconstructionSettings(_Settings):
     lidar_rays: Annotated[int, Field(ge=0)] = 256
     lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.05, description="share of the largest LiDAR residuals left out of a batch"
+    )
+    surface_samples: Annotated[int, Field(ge=0)] = Field(
+        default=64, description="LiDAR returns, and points of free space before them, a learned actor and step"
     )
     smallest_actor: PositiveInt = Field(
         default=8,

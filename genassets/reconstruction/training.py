@@ -18,11 +18,19 @@ from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
 from genassets.errors import StageError
-from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss
+from genassets.reconstruction.lidar_surface import draw_surface_samples
+from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss, surface_loss
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
-from genassets.rendering.renderer import ActorFields, RenderSettings, SampleCounts, cull, render_rays
+from genassets.rendering.renderer import (
+    ActorFields,
+    RenderSettings,
+    SampleCounts,
+    actor_distance,
+    cull,
+    render_rays,
+)
 
 CURVE_EVERY = 20
 
@@ -146,6 +154,11 @@ class Trainer:
         if len(batch.lidar_distance):
             distance = rendered.distance[camera_rays:]
             losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
+        samples = draw_surface_samples(self.data[number].returns, actors, settings.surface_samples, generator)
+        if len(samples.position):
+            sdf, _ = actor_distance(samples.position, samples.actor, fields)
+            on_surface, free = sdf.tensor_split([samples.returns])
+            losses["surface"] = surface_loss(on_surface, free, samples.clearance, settings.lidar_trim)
         return StepResult(losses, actors, rendered.counts), fields
 
     def _remember(self, actors: Tensor, fields: ActorFields) -> None:

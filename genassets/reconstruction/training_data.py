@@ -17,6 +17,7 @@ from genassets.errors import StageError
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import pixel_centres
 from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
+from genassets.reconstruction.lidar_surface import ActorReturns, actor_returns
 from genassets.reconstruction.scene import (
     LidarSweepRays,
     SceneFrame,
@@ -64,6 +65,7 @@ class TrainingLog:
     images: list[UInt8[Tensor, "height width 3"]]
     observations: list[Observation]
     lidar: list[LidarSweepRays]
+    returns: Mapping[int, ActorReturns]
     occupancy: OccupancyGrid
 
 
@@ -197,7 +199,7 @@ def _training_log(
         2 * model.background_height,
     )
     images = [torch.from_numpy(load_image(log, view)) for view in views]
-    return TrainingLog(scene, views, images, observations, sweeps, occupancy)
+    return TrainingLog(scene, views, images, observations, sweeps, actor_returns(sweeps), occupancy)
 
 
 def _observed(view: View, smallest: int) -> list[int]:
