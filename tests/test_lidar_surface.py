@@ -68,9 +68,9 @@ def test_actors_without_lidar_are_left_out() -> None:
 def test_the_loss_is_zero_for_the_true_distance_and_counts_what_is_missing() -> None:
     nothing = torch.zeros(0)
     assert surface_loss(torch.zeros(4), torch.full((3,), 0.2), torch.full((3,), 0.15), 0.05) == 0
-    assert surface_loss(nothing, torch.tensor([0.05, 0.30]), torch.tensor([0.15, 0.15]), 0.05) == pytest.approx(
-        0.05
-    )
+    assert surface_loss(
+        nothing, torch.tensor([0.05, 0.30]), torch.tensor([0.15, 0.15]), 0.05
+    ) == pytest.approx(0.05)
     # Of twenty returns the worst one, a wrong label, is left out.
     wrong = torch.tensor([0.1] * 19 + [50.0])
     assert surface_loss(wrong, nothing, nothing, 0.05) == pytest.approx(0.1)

@@ -64,7 +64,8 @@ def actor_returns(sweeps: Iterable[LidarSweepRays]) -> dict[int, ActorReturns]:
             points.setdefault(actor, []).append(transform_points(box_from_scene, end[returned]))
             passages.setdefault(actor, []).append(rows)
     return {
-        actor: ActorReturns(_joined(points[actor], 3), _joined(passages[actor], 8)) for actor in sorted(points)
+        actor: ActorReturns(_joined(points[actor], 3), _joined(passages[actor], 8))
+        for actor in sorted(points)
     }
 
 

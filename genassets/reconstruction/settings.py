@@ -118,7 +118,8 @@ class ReconstructionSettings(_Settings):
         default=0.05, description="share of the largest LiDAR residuals left out of a batch"
     )
     surface_samples: Annotated[int, Field(ge=0)] = Field(
-        default=64, description="LiDAR returns, and points of free space before them, a learned actor and step"
+        default=64,
+        description="LiDAR returns, and points of free space before them, a learned actor and step",
     )
     smallest_actor: PositiveInt = Field(
         default=8,
