@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,11 +22,12 @@ from genassets.reconstruction.scene import LidarSweepRays, PlacedActors
 SIZE = np.array([4.0, 2.0, 1.5])
 POSITION = np.array([10.0, 3.0, 0.0])
 HEADING = math.pi / 2  # the actor's front looks along the scene's y
+PLACED = PlacedActors(np.array([5]), yaw_pose(HEADING, POSITION)[None], SIZE[None])
 
 
 def sweep(returned: bool) -> LidarSweepRays:
     """Rays from the origin to points on the actor's side that looks at it, or through it to twice as far."""
-    heights = np.linspace(-0.5, 0.5, 11)
+    heights = np.linspace(-0.5, 0.5, 11)  # the box reaches from -0.75 to 0.75
     face = np.column_stack((np.full(11, 9.0), np.full(11, 3.0), heights))
     distance = np.linalg.norm(face, axis=1)
     return LidarSweepRays(
@@ -35,7 +37,7 @@ def sweep(returned: bool) -> LidarSweepRays:
         distance=distance if returned else 2 * distance,
         actor=np.full(11, 5 if returned else -1),
         crossed=np.full(11, -1 if returned else 5),
-        actors=PlacedActors(np.array([5]), yaw_pose(HEADING, POSITION)[None], SIZE[None]),
+        actors=PLACED,
     )
 
 
@@ -45,6 +47,14 @@ def test_returns_lie_on_the_side_that_was_hit() -> None:
     # Scene x = 9 is the actor's left side: y = +1 in its frame.
     assert returns[5].points[:, 1].numpy() == pytest.approx(1.0, abs=1e-6)
     assert len(returns[5].passages) == 0  # nothing of the box lies before its own side
+
+
+def test_the_road_below_an_actor_is_no_part_of_it() -> None:
+    low = replace(sweep(returned=True), actors=replace(PLACED, sizes=np.array([[4.0, 2.0, 1.0]])))
+    seen = actor_returns([low])[5]
+    # The box now ends at -0.5: of eleven returns a tenth of a metre apart the lowest three may be the road.
+    assert len(seen.points) == 8
+    assert seen.points[:, 2].min() > -0.3
 
 
 def test_a_ray_through_the_box_leaves_free_space_and_no_return() -> None:

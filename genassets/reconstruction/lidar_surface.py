@@ -17,13 +17,17 @@ from genassets.reconstruction.scene import LidarSweepRays
 CLEARANCE = 0.15
 """Metres of signed distance that free space asks for at most: further off, a ray does not know its nearest surface."""
 
+GROUND = 0.2
+"""Returns this many metres above the bottom of a box, or lower, may be the road: labels stand on it, or in it."""
+
 
 @dataclass(frozen=True)
 class ActorReturns:
     """One actor's share of the training sweeps, in its box frame, in metres.
 
-    points (N, 3): returns inside its padded box. Each row of passages (M, 8) is the part of a ray inside its
-    box that met nothing: origin (3), unit direction (3), and the distances at which it begins and ends.
+    points (N, 3): returns inside its padded box, the road left out. Each row of passages (M, 8) is the part
+    of a ray inside its box that met nothing: origin (3), unit direction (3), and the distances at which it
+    begins and ends.
     """
 
     points: Float[Tensor, "returns 3"]
@@ -61,12 +65,18 @@ def actor_returns(sweeps: Iterable[LidarSweepRays]) -> dict[int, ActorReturns]:
             near, far = intersect_box(origin, direction, size)
             near, far = np.maximum(near, 0), np.minimum(far, sweep.distance[met])
             rows = np.column_stack((origin, direction, near, far))[far > near]
-            points.setdefault(actor, []).append(transform_points(box_from_scene, end[returned]))
+            points.setdefault(actor, []).append(
+                _above_ground(transform_points(box_from_scene, end[returned]), size)
+            )
             passages.setdefault(actor, []).append(rows)
     return {
         actor: ActorReturns(_joined(points[actor], 3), _joined(passages[actor], 8))
         for actor in sorted(points)
     }
+
+
+def _above_ground(points: np.ndarray, size: np.ndarray) -> np.ndarray:
+    return points[points[:, 2] > GROUND - size[2] / 2]
 
 
 def _joined(parts: list[np.ndarray], width: int) -> Tensor:
