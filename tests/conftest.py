@@ -4,8 +4,14 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from tiny_reconstruction import Prepared
+
+    from genassets.driving import Log
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -29,3 +35,24 @@ def real_log_root() -> Path:
 def real_log(real_log_root: Path) -> Path:
     """The real PandaSet log 002."""
     return real_log_root / "002"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
+    """The tiny log with the cameras that reconstruction's tests learn from."""
+    from tiny_log import build_tiny_log
+    from tiny_reconstruction import CAMERAS
+
+    from genassets.driving import open_log
+
+    return open_log(build_tiny_log(tmp_path_factory.mktemp("logs") / "tiny", frames=4, cameras=CAMERAS))
+
+
+@pytest.fixture(scope="module")
+def prepared(log: Log) -> Prepared:
+    """That log, prepared for reconstruction."""
+    from tiny_reconstruction import CAMERAS, SETTINGS, STRIDE, Prepared, even
+
+    from genassets.reconstruction.training_data import prepare_training
+
+    return Prepared(*prepare_training([log], CAMERAS, even, SETTINGS, STRIDE))

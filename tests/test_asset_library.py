@@ -10,23 +10,17 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from safetensors.torch import load_file, save_file
-from tiny_log import build_tiny_log
-from tiny_reconstruction import CAMERAS, SETTINGS, STRIDE, Prepared, even
+from tiny_reconstruction import SETTINGS, Prepared
 
-from genassets.driving import open_log
 from genassets.errors import StageError
 from genassets.reconstruction.library import load_library, make_library, save_library
-from genassets.reconstruction.training_data import prepare_training
 
 
 @pytest.fixture(scope="module")
-def library(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def library(prepared: Prepared, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained one."""
-    log = open_log(build_tiny_log(tmp_path_factory.mktemp("logs") / "tiny", frames=4, cameras=CAMERAS))
-    assets, data = prepare_training([log], CAMERAS, even, SETTINGS, STRIDE)
-    made = make_library(
-        assets, Prepared(assets, data).model(), SETTINGS, [data[0].scene], [data[0].occupancy]
-    )
+    data = prepared.data[0]
+    made = make_library(prepared.assets, prepared.model(), SETTINGS, [data.scene], [data.occupancy])
     directory = tmp_path_factory.mktemp("library")
     save_library(made, directory)
     return directory

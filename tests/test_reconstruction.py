@@ -11,10 +11,10 @@ import pandas as pd
 import pytest
 import torch
 import yaml
-from tiny_log import CAR_SIZE, MOVING, PARKED, WALKER, build_tiny_log
-from tiny_reconstruction import CAMERAS, SETTINGS, STRIDE, Prepared, changed, even
+from tiny_log import CAR_SIZE, MOVING, PARKED, WALKER
+from tiny_reconstruction import SETTINGS, STRIDE, Prepared, changed
 
-from genassets.driving import Log, open_log
+from genassets.driving import Log
 from genassets.errors import StageError
 from genassets.geometry.turntable import turntable_camera
 from genassets.reconstruction import training
@@ -24,7 +24,7 @@ from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.scene_renderer import SceneRenderer
 from genassets.reconstruction.settings import ReconstructionSettings
 from genassets.reconstruction.training import Trainer, build_model, train
-from genassets.reconstruction.training_data import draw_batch, prepare_training
+from genassets.reconstruction.training_data import draw_batch
 
 PAPER_PROFILE = Path(__file__).parents[1] / "data_specs" / "profiles" / "paper.yaml"
 LEARNING_STEPS = 60
@@ -46,16 +46,6 @@ def rgb_error(trainer: Trainer) -> float:
     ]
     with torch.no_grad():
         return float(np.mean([trainer.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches]))
-
-
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    return open_log(build_tiny_log(tmp_path_factory.mktemp("logs") / "tiny", frames=4, cameras=CAMERAS))
-
-
-@pytest.fixture(scope="module")
-def prepared(log: Log) -> Prepared:
-    return Prepared(*prepare_training([log], CAMERAS, even, SETTINGS, STRIDE))
 
 
 @pytest.fixture(scope="module")

@@ -22,16 +22,6 @@ from genassets.reconstruction.scene_renderer import SceneRenderer
 from genassets.reconstruction.training_data import draw_batch, prepare_training, training_frames
 
 
-@pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Log:
-    return open_log(build_tiny_log(tmp_path_factory.mktemp("logs") / "tiny", frames=4, cameras=CAMERAS))
-
-
-@pytest.fixture(scope="module")
-def prepared(log: Log) -> Prepared:
-    return Prepared(*prepare_training([log], CAMERAS, even, SETTINGS, STRIDE))
-
-
 def test_a_log_without_actors_is_refused(tmp_path: Path) -> None:
     empty = open_log(build_tiny_log(tmp_path / "empty", frames=2, cameras=CAMERAS[:1], actors=False))
     with pytest.raises(StageError, match=r"\(empty\) shows an actor of at least 4 pixels"):

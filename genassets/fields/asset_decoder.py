@@ -64,7 +64,9 @@ class PatchPath(nn.Module):
             channels_in + hidden, channels_out, side, stride=scale, padding=(side - scale) // 2
         )
         ramp = 1 - (2 * (torch.arange(side) + 0.5) / side - 1).abs()
-        with torch.no_grad():  # patches fade out, so that an untrained plane has no seams
+        with torch.no_grad():
+            # Patches fade towards their edges. The usual start divides by the side, as if one texel summed a whole
+            # patch; it sums four, so most of that is taken back. Codes explain planes soonest from there.
             self.patches.weight.mul_(side / 4 * ramp[:, None] * ramp)
 
     def forward(self, x: Float[Tensor, "n cin h w"]) -> Float[Tensor, "n cout height width"]:

@@ -19,11 +19,7 @@ def lidar_loss(
 
     Wrong labels and returns from things that nobody annotated are among the largest.
     """
-    residual = (rendered - observed).abs()
-    kept = residual.numel() - int(trim * residual.numel())
-    if kept == 0:
-        return residual.sum()
-    return residual.topk(kept, largest=False).values.mean()
+    return _trimmed_mean((rendered - observed).abs(), trim)
 
 
 def surface_loss(
@@ -37,9 +33,14 @@ def surface_loss(
     The mean absolute distance at returns, without the largest `trim` share, plus the mean shortfall from
     `clearance` in free space.
     """
-    at_returns = lidar_loss(on_surface, torch.zeros_like(on_surface), trim)
     shortfall = (clearance - in_free_space).clamp(min=0)
-    return at_returns + shortfall.sum() / max(len(shortfall), 1)
+    return _trimmed_mean(on_surface.abs(), trim) + _trimmed_mean(shortfall, 0.0)
+
+
+def _trimmed_mean(residual: Float[Tensor, " n"], trim: float) -> Float[Tensor, ""]:
+    """Mean without the largest `trim` share; 0 of nothing."""
+    kept = residual.numel() - int(trim * residual.numel())
+    return residual.topk(kept, largest=False).values.mean() if kept else residual.sum()
 
 
 def kl_loss(mean: Float[Tensor, "n c h w"], log_variance: Float[Tensor, "n c h w"]) -> Float[Tensor, ""]:

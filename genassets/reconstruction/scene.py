@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.driving import Log, actor_mask
+from genassets.driving import Log, Track, actor_mask
 from genassets.driving.sweep import SPINNING, SPINNING_POSITION
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
@@ -44,8 +44,30 @@ class PlacedActors:
     scene_from_box: Array
     sizes: Array
 
+    @classmethod
+    def of(cls, tracks: Sequence[Track], poses: Sequence[Array], index: Mapping[str, int]) -> PlacedActors:
+        """Tracks at scene_from_box poses (4, 4)."""
+        return cls(
+            np.array([index[track.actor_id] for track in tracks], dtype=np.int64),
+            np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
+            np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3),
+        )
+
     def select(self, keep: NDArray) -> PlacedActors:
         return PlacedActors(self.index[keep], self.scene_from_box[keep], self.sizes[keep])
+
+    def crossing(
+        self, row: int, origins: Array, directions: Array, padding: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> tuple[Array, Array]:
+        """Distances (N,) at which rays (N, 3) of the scene enter and leave a box; infinite where they miss it."""
+        box_from_scene = invert_pose(self.scene_from_box[row])
+        near, far = intersect_box(
+            transform_points(box_from_scene, origins),
+            transform_directions(box_from_scene, directions),
+            self.sizes[row] + 2 * np.asarray(padding),
+        )
+        met = (near < far) & (far > 0)
+        return np.where(met, np.maximum(near, 0.0), np.inf), np.where(met, far, np.inf)
 
 
 @dataclass(frozen=True)
@@ -110,11 +132,7 @@ def placed_actors(
     """The log's actors that have an index, as they stand at a time within a frame."""
     tracks = [track for track in log.tracks if track.actor_id in index and track.covers(frame)]
     poses = [scene.pose(track.pose_at(time)) for track in tracks]
-    return PlacedActors(
-        np.array([index[track.actor_id] for track in tracks], dtype=np.int64),
-        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
-        np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3),
-    )
+    return PlacedActors.of(tracks, poses, index)
 
 
 def make_view(
@@ -176,22 +194,16 @@ def lidar_rays(
     for track in tracks:
         owner[actor_mask(sweep, track, frame, padding)] = index[track.actor_id]
         poses.append(scene.pose(track.world_from_box[int(np.flatnonzero(track.frames == frame)[0])]))
-    actors = PlacedActors(
-        np.array([index[track.actor_id] for track in tracks], dtype=np.int64),
-        np.array(poses, dtype=np.float64).reshape(-1, 4, 4),
-        np.array([track.size for track in tracks], dtype=np.float64).reshape(-1, 3),
-    )
+    actors = PlacedActors.of(tracks, poses, index)
     keep = (sweep.sensor == SPINNING) & (distance > 0.5) & (distance < farthest)
     direction = (points[keep] - origin) / distance[keep, None]
     distance, owner = distance[keep], owner[keep]
     crossed = np.full(len(distance), -1, dtype=np.int64)
-    for number, pose, size in zip(actors.index, actors.scene_from_box, actors.sizes, strict=True):
-        box_from_scene = invert_pose(pose)
-        ahead = np.flatnonzero(direction @ (pose[:3, 3] - origin) > 0)
-        start = np.broadcast_to(transform_points(box_from_scene, origin), (len(ahead), 3))
-        toward = transform_directions(box_from_scene, direction[ahead])
-        near, far = intersect_box(start, toward, size + 2 * np.asarray(padding))
-        crossed[ahead[(near < far) & (far < distance[ahead])]] = number
+    for row, number in enumerate(actors.index):
+        ahead = np.flatnonzero(direction @ (actors.scene_from_box[row, :3, 3] - origin) > 0)
+        start = np.broadcast_to(origin, (len(ahead), 3))
+        left = actors.crossing(row, start, direction[ahead], padding)[1]
+        crossed[ahead[left < distance[ahead]]] = number
     crossed[owner >= 0] = -1
     return LidarSweepRays(frame, origin, direction, distance, owner, crossed, actors)
 

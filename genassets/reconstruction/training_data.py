@@ -14,9 +14,7 @@ from torch import Tensor
 
 from genassets.driving import Log
 from genassets.errors import StageError
-from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import pixel_centres
-from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 from genassets.reconstruction.lidar_surface import ActorReturns, actor_returns
 from genassets.reconstruction.scene import (
     LidarSweepRays,
@@ -216,27 +214,13 @@ def _hidden(view: View, row: int) -> bool:
     others = np.flatnonzero((b[:, 0] < x1) & (b[:, 2] > x0) & (b[:, 1] < y1) & (b[:, 3] > y0))
     grid = pixel_centres(0, 0, VISIBILITY_RAYS, VISIBILITY_RAYS) / VISIBILITY_RAYS
     origins, directions = view.rays((x0, y0) + grid * (x1 - x0, y1 - y0))
-    entered = _crossing(view, row, origins, directions)[0]
+    entered = view.actors.crossing(row, origins, directions)[0]
     open_rays = np.flatnonzero(np.isfinite(entered))
     met = len(open_rays)
     for other in others[others != row].tolist():
-        left = _crossing(view, other, origins[open_rays], directions[open_rays])[1]
+        left = view.actors.crossing(other, origins[open_rays], directions[open_rays])[1]
         open_rays = open_rays[~(left <= entered[open_rays])]
     return met > 0 and len(open_rays) == 0
-
-
-def _crossing(
-    view: View, row: int, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (N,) at which rays enter and leave an actor's box; infinite where they miss it."""
-    box_from_scene = invert_pose(view.actors.scene_from_box[row])
-    near, far = intersect_box(
-        transform_points(box_from_scene, origins),
-        transform_directions(box_from_scene, directions),
-        view.actors.sizes[row],
-    )
-    met = (near < far) & (far > 0)
-    return np.where(met, np.maximum(near, 0.0), np.inf), np.where(met, far, np.inf)
 
 
 def _of_learnable(view: View, number_of: np.ndarray) -> View:

@@ -78,7 +78,7 @@ class Inputs:
 
 
 def _nothing(config: Any) -> Mapping[str, str]:
-    """What a stage that reads only its inputs reads besides them."""
+    """Of a stage that neither reads more than its inputs nor needs pretrained files."""
     return {}
 
 
