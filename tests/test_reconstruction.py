@@ -19,7 +19,7 @@ from genassets.errors import StageError
 from genassets.geometry.turntable import turntable_camera
 from genassets.reconstruction import training
 from genassets.reconstruction.library import load_library, make_library, save_library
-from genassets.reconstruction.losses import kl_loss, lidar_loss
+from genassets.reconstruction.losses import kl_loss, lidar_loss, total_variation
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.scene_renderer import SceneRenderer
 from genassets.reconstruction.settings import ReconstructionSettings
@@ -200,6 +200,14 @@ def test_kl_in_closed_form() -> None:
     assert kl_loss(zero, zero + 1).item() == pytest.approx((math.e - 2) / 2)
     assert kl_loss(zero, zero - 30).item() == pytest.approx(14.5)
     assert kl_loss(zero, zero + 30).item() == pytest.approx((math.exp(30) - 31) / 2)
+
+
+def test_total_variation_counts_steps_along_both_axes() -> None:
+    planes = torch.zeros(2, 3, 4, 5, 5)
+    assert total_variation(planes + 7).item() == 0
+    planes[..., 2:] = 1  # one step of 1 among four neighbours along the width, none along the height
+    assert total_variation(planes).item() == pytest.approx(0.25)
+    assert total_variation(2 * planes.transpose(-1, -2)).item() == pytest.approx(0.5)
 
 
 def test_lidar_loss_leaves_out_the_worst_twentieth() -> None:

@@ -85,7 +85,7 @@ def test_a_log_without_lidar_trains_on_images_alone(tmp_path: Path) -> None:
     dark = open_log(build_tiny_log(tmp_path / "tiny", frames=2, cameras=CAMERAS[:1], sweeps=False))
     assets, data = prepare_training([dark], CAMERAS[:1], even, SETTINGS, STRIDE)
     trainer = Prepared(assets, data).trainer()
-    assert trainer.advance().losses.keys() == {"rgb", "kl"}
+    assert trainer.advance().losses.keys() == {"rgb", "kl", "total_variation"}
     assert not data[0].occupancy.cells.any()
 
 

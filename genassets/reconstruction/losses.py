@@ -43,6 +43,14 @@ def _trimmed_mean(residual: Float[Tensor, " n"], trim: float) -> Float[Tensor, "
     return residual.topk(kept, largest=False).values.mean() if kept else residual.sum()
 
 
+def total_variation(planes: Float[Tensor, "n planes c h w"]) -> Float[Tensor, ""]:
+    """Mean absolute difference of neighbouring texels along width plus that along height.
+
+    Views that no training image shows follow from texels that their neighbours hold in place.
+    """
+    return planes.diff(dim=-1).abs().mean() + planes.diff(dim=-2).abs().mean()
+
+
 def kl_loss(mean: Float[Tensor, "n c h w"], log_variance: Float[Tensor, "n c h w"]) -> Float[Tensor, ""]:
     """KL divergence of the codes from a standard normal, averaged over their entries.
 

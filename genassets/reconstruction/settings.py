@@ -87,6 +87,7 @@ class LossWeights(_Settings):
     rgb: Weight = 1.0
     lidar: Weight = 0.01
     surface: Weight = 0.05
+    total_variation: Weight = 0.02
     kl: Weight = 1e-5
 
 

@@ -19,7 +19,7 @@ from torch.nn.utils import get_total_norm
 from genassets.driving import CLASSES
 from genassets.errors import StageError
 from genassets.reconstruction.lidar_surface import draw_surface_samples
-from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss, surface_loss
+from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss, surface_loss, total_variation
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
@@ -150,7 +150,11 @@ class Trainer:
         image = model.rgb(feature_map.permute(0, 3, 1, 2))
         height, width = image.shape[-2:]
         image = image[..., margin : height - margin, margin : width - margin]
-        losses = {"rgb": rgb_loss(image, batch.pixels), "kl": kl_loss(latents.mean, latents.log_variance)}
+        losses = {
+            "rgb": rgb_loss(image, batch.pixels),
+            "kl": kl_loss(latents.mean, latents.log_variance),
+            "total_variation": total_variation(decoded),
+        }
         if len(batch.lidar_distance):
             distance = rendered.distance[camera_rays:]
             losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
