@@ -53,7 +53,7 @@ def render_ray(
     rays: Rays, index: int, actors: ActorFields, background: BackgroundFields | None, settings: RenderSettings
 ) -> tuple[Tensor, float, float]:
     """Feature, expected distance and opacity of one ray."""
-    samples: list[tuple[float, float, Tensor]] = []  # distance, alpha, feature
+    samples: list[tuple[float, float, Tensor, bool]] = []  # distance, alpha, feature, whether sky
     hits = rays.hits
     for hit in np.flatnonzero(hits.ray.numpy() == index):
         near, far = float(hits.near[hit]), float(hits.far[hit])
@@ -71,16 +71,18 @@ def render_ray(
             residual, middle = actors.field.distance(plane_features[None])
             sdf = actor_distance(position, actors.size[actor], float(residual))
             alpha = opacity(sdf, float(actors.beta), length, ACTOR_REFERENCE_STEP)
-            samples.append((distance, alpha, actors.field.feature(middle, hits.direction[hit][None])[0]))
+            feature = actors.field.feature(middle, hits.direction[hit][None])[0]
+            samples.append((distance, alpha, feature, False))
             start += step
     if background is not None:
-        samples += background_samples(rays, index, background, settings)
+        for distance, alpha, feature in background_samples(rays, index, background, settings):
+            samples.append((distance, alpha, feature, distance >= settings.background_far))
     samples.sort(key=lambda sample: sample[0])
     light, feature, expected, solid = 1.0, torch.zeros_like(samples[0][2]), 0.0, 0.0
-    for distance, alpha, value in samples:
+    for distance, alpha, value, sky in samples:
         weight = light * alpha
         feature = feature + weight * value
-        if distance < settings.background_far:
+        if not sky:
             expected += weight * distance
             solid += weight
         light *= 1 - alpha

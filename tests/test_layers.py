@@ -14,7 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 LAYERS: tuple[tuple[str, ...], ...] = (
     ("flows",),
     ("genassets.cli",),
-    ("genassets.bench",),
+    ("genassets.bench", "genassets.hard_cases"),
     ("genassets.tracking", "genassets.reporting"),
     ("genassets.pipeline",),
     ("genassets.stages",),

@@ -18,6 +18,7 @@ from genassets.cli import weights
 from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
+from genassets.cli.hard_cases import hard_cases
 from genassets.cli.inspect import inspect
 from genassets.cli.list import list_runs
 from genassets.cli.plan import plan
@@ -74,6 +75,7 @@ app.command("verify")(verify)
 app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
+app.command("hard-cases")(hard_cases)
 app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")
 

@@ -23,6 +23,9 @@ __all__ = ["CameraStream", "Log", "Sweep", "Track"]
 # A camera fires up to 0.1 s before the sweep is complete, so a track's first and last frames ask for a time
 # just outside its span; a moving actor is carried on at its last speed for this long at most, in seconds.
 EXTRAPOLATION_LIMIT = 0.15
+# An actor that passes behind the car may be seen at the end of one turn of the LiDAR and at once again: over a
+# stretch shorter than this, in seconds, the annotators' centimetres would pass for speed.
+SPEED_BASELINE = 0.05
 
 
 @dataclass(frozen=True)
@@ -86,19 +89,26 @@ class Track:
     def pose_at(self, time: float) -> NDArray[np.float64]:
         """World_from_box (4, 4) at a time in seconds since Log.start_time.
 
-        Interpolated inside the track's span. Outside it the end pose holds, save that a moving actor goes on
-        with the speed of its first or last interval for at most EXTRAPOLATION_LIMIT seconds.
+        Interpolated inside the track's span. Outside it the end pose holds, save that a moving actor goes on for at
+        most EXTRAPOLATION_LIMIT seconds, with its speed over the first or last SPEED_BASELINE seconds or more.
         """
         pose = interpolate_pose(self.times, self.world_from_box, time)
         if self.stationary or len(self.times) < 2:
             return pose
         outside = min(time - self.times[0], 0.0) + max(time - self.times[-1], 0.0)
         if outside:
-            first, second = (0, 1) if outside < 0 else (-2, -1)
-            step = self.world_from_box[second, :3, 3] - self.world_from_box[first, :3, 3]
-            velocity = step / (self.times[second] - self.times[first])
+            velocity = self._end_velocity(0 if outside < 0 else -1)
             pose[:3, 3] += velocity * float(np.clip(outside, -EXTRAPOLATION_LIMIT, EXTRAPOLATION_LIMIT))
         return pose
+
+    def _end_velocity(self, end: int) -> NDArray[np.float64]:
+        """Velocity (3,) in m/s at the first (0) or last (-1) pose, over SPEED_BASELINE or more; 0 where too short."""
+        elapsed = self.times - self.times[end]
+        far = np.flatnonzero(np.abs(elapsed) >= SPEED_BASELINE)
+        if len(far) == 0:
+            return np.zeros(3)
+        other = far[end]
+        return (self.world_from_box[other, :3, 3] - self.world_from_box[end, :3, 3]) / elapsed[other]
 
     def covers(self, frame: int) -> bool:
         """Whether the actor is annotated in this frame."""

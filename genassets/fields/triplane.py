@@ -11,6 +11,12 @@ PLANE_AXES = ((0, 1), (0, 2), (1, 2))
 """For each plane the coordinate that runs along its width and the one that runs along its height."""
 
 
+def half_planes(planes: Float[Tensor, "n planes channels height width"]) -> Tensor:
+    """Planes in half precision, to be kept; values beyond its range are held at its ends, not made infinite."""
+    largest = torch.finfo(torch.float16).max
+    return planes.detach().clamp(-largest, largest).half()
+
+
 def interpolate_triplanes(
     planes: Float[Tensor, "slots planes channels height width"],
     slot: Int[Tensor, " samples"],
@@ -19,6 +25,7 @@ def interpolate_triplanes(
     """Interpolate each sample on the three planes of its slot and concatenate (paper section 3.1).
 
     coordinates lie in [-1, 1]; -1 and 1 are the centres of the outermost texels, values beyond are held.
+    Planes may be kept in half precision; they are interpolated in the coordinates'.
     Returns planes x channels features a sample, plane by plane in the order xy, xz, yz.
 
     All planes are laid out as one atlas, slots downwards and planes sideways, so that any mixture of
@@ -26,7 +33,7 @@ def interpolate_triplanes(
     """
     slots, plane_count, channels, height, width = planes.shape
     atlas = planes.permute(2, 0, 3, 1, 4).reshape(1, channels, slots * height, plane_count * width)
-    atlas = atlas.contiguous(memory_format=torch.channels_last)
+    atlas = atlas.to(coordinates.dtype).contiguous(memory_format=torch.channels_last)
     scale = coordinates.clamp(-1, 1) * 0.5 + 0.5
     axes = torch.tensor(PLANE_AXES, device=coordinates.device)
     tile = torch.arange(plane_count, device=coordinates.device) * width

@@ -67,7 +67,8 @@ def intersect_box(origins: ArrayLike, directions: ArrayLike, size: ArrayLike) ->
     half = np.asarray(size, np.float64) / 2
     parallel = directions == 0
     safe = np.where(parallel, 1.0, directions)
-    first, second = (-half - origins) / safe, (half - origins) / safe
+    with np.errstate(over="ignore"):  # all but parallel, a slab is left at infinity: that is right
+        first, second = (-half - origins) / safe, (half - origins) / safe
     # A ray parallel to a slab is inside it everywhere or nowhere.
     between = np.abs(origins) <= half
     near = np.where(parallel, np.where(between, -np.inf, np.inf), np.minimum(first, second))

@@ -106,7 +106,9 @@ def heading_of(pose: ArrayLike) -> Array:
 
 def wrap_angle(angle: ArrayLike) -> Array:
     """Angles in radians brought into [-pi, pi)."""
-    return (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2 * np.pi) - np.pi
+    # The remainder of a number just below zero rounds up to the whole turn.
+    return np.where(wrapped < np.pi, wrapped, -np.pi)
 
 
 def slerp(start: ArrayLike, end: ArrayLike, fraction: float) -> Array:

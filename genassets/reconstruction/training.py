@@ -18,6 +18,7 @@ from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
 from genassets.errors import StageError
+from genassets.fields.triplane import half_planes
 from genassets.reconstruction.lidar_surface import draw_surface_samples
 from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss, surface_loss, total_variation
 from genassets.reconstruction.model import AssetModel
@@ -75,7 +76,7 @@ class Trainer:
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
         self.planes = torch.cat(
-            [planes.half() for _, planes in decode_all(model)]
+            [half_planes(planes) for _, planes in decode_all(model)]
         )  # of every actor, as last decoded: what a step that only looks past an actor uses
         rates = settings.rates
         groups = parameter_groups(model, rates)
@@ -167,7 +168,7 @@ class Trainer:
 
     def _remember(self, actors: Tensor, fields: ActorFields) -> None:
         """Keep what a step decoded: planes for when its actors are bystanders, one actor's coarse distance."""
-        self.planes[actors] = fields.planes[: len(actors)].detach().half()
+        self.planes[actors] = half_planes(fields.planes[: len(actors)])
         if self.step % self.settings.rendering.coarse_refresh == 0:
             stalest = int(actors[self.refreshed[actors].argmin()])
             self.model.refresh_coarse_distance(stalest, fields)

@@ -11,13 +11,13 @@ def depth_order(ray: Int[Tensor, " samples"], distance: Float[Tensor, " samples"
     """The permutation that sorts samples by ray and, along a ray, front to back.
 
     Overlapping actors and the background are thereby interleaved by depth, whatever field they come from.
+    Distances are not negative. Samples at the same distance keep their order.
     """
-    # One sort by a combined key: 53 bits hold 2^23 rays and distances to 2^20 m at better than a micrometre.
-    return torch.argsort(ray.double() * FARTHEST + distance.double(), stable=True)
-
-
-FARTHEST = 2.0**20
-"""Distances in metres stay below this."""
+    if distance.dtype == torch.float32:
+        # One sort by a combined key that loses nothing: positive floats sort like their bits.
+        return torch.argsort((ray << 31) + distance.view(torch.int32), stable=True)
+    by_distance = torch.argsort(distance, stable=True)
+    return by_distance[torch.argsort(ray[by_distance], stable=True)]
 
 
 def log_light(

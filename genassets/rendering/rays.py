@@ -57,11 +57,13 @@ def cast_rays(
     sizes: NDArray[np.float64],
     limit: NDArray[np.float64] | None = None,
     device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float32,
 ) -> Rays:
     """Intersect rays with the padded boxes of some actors, in float64, before anything is cast down.
 
     origins and directions (rays, 3) in the scene frame; actors are indices into the library, with their
-    poses (actors, 4, 4) and sizes (actors, 3) as length, width, height.
+    poses (actors, 4, 4) and sizes (actors, 3) as length, width, height. With dtype float64 nothing is cast down:
+    what float32 is compared with.
     """
     limit = np.full(len(origins), np.inf) if limit is None else limit
     parts: list[tuple[NDArray, ...]] = []
@@ -76,13 +78,13 @@ def cast_rays(
     empty = (np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     ray, actor, *rest = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
 
-    def single(array: NDArray) -> Tensor:
-        return torch.tensor(np.ascontiguousarray(array), dtype=torch.float32, device=device)
+    def cast(array: NDArray) -> Tensor:
+        return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
 
     hits = Hits(
-        torch.as_tensor(ray, device=device), torch.as_tensor(actor, device=device), *(single(a) for a in rest)
+        torch.as_tensor(ray, device=device), torch.as_tensor(actor, device=device), *(cast(a) for a in rest)
     )
-    return Rays(single(origins), single(directions), single(limit), hits)
+    return Rays(cast(origins), cast(directions), cast(limit), hits)
 
 
 def concatenate_rays(parts: Sequence[Rays]) -> Rays:

@@ -119,7 +119,9 @@ class SampleCounts:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What rays see: feature, expected distance in metres (sky left out), opacity (sky left out)."""
+    """What rays see: feature, expected distance in metres, opacity; both without what of the background lies
+    beyond background_far, which is sky.
+    """
 
     feature: Float[Tensor, "rays channels"]
     distance: Float[Tensor, " rays"]
@@ -194,7 +196,10 @@ def render_rays(
     ray = evaluated.ray[order]
     weight = render_weights(evaluated.log_transmittance[order], ray)
     distance = evaluated.distance[order]
-    solid = (distance < settings.background_far).to(weight.dtype)
+    sky = torch.cat(
+        (torch.zeros_like(seen.hit, dtype=torch.bool), static.distance >= settings.background_far)
+    )
+    solid = (~sky[order]).to(weight.dtype)
     geometry = torch.stack((distance * solid, solid), dim=-1)
     sums = accumulate(weight, geometry, ray, len(rays))
     return Rendered(
