@@ -26,7 +26,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("genassets.rendering",),
     ("genassets.fields",),
     ("genassets.driving",),
-    ("genassets.geometry", "genassets.weights"),
+    ("genassets.geometry", "genassets.perceptual", "genassets.weights"),
     ("genassets.package_archive", "genassets.city_spec", "genassets.system_libraries"),
     ("genassets.errors",),
 )

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from genassets import weights
-from genassets.evaluation.lpips import Backbone, Lpips, masked_distances
+from genassets.perceptual.lpips import Backbone, Lpips, masked_distances
 
 
 def network(backbone: Backbone) -> Lpips:

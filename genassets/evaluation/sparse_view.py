@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from genassets.evaluation.baselines import Bounds, ColourMean, place_crop
 from genassets.evaluation.image import composited_on_black, masked_psnr, masked_ssim, psnr_on_black
-from genassets.evaluation.lpips import Lpips, masked_distances
 from genassets.evaluation.observation_crop import ImageScale, comparison_region, crop
 from genassets.evaluation.viewpoint import (
     ViewDifference,
@@ -29,6 +28,7 @@ from genassets.evaluation.viewpoint import (
     nearest_view,
     view_group,
 )
+from genassets.perceptual.lpips import Lpips, masked_distances
 
 if TYPE_CHECKING:
     from genassets.driving.log import Log

@@ -11,8 +11,8 @@ import pandas as pd
 import pyarrow as pa
 
 from genassets.evaluation.image import capped
-from genassets.evaluation.lpips import masked_lpips_method
 from genassets.evaluation.sparse_view import MEASURES, PREDICTORS, Observation, Scored, View
+from genassets.perceptual.lpips import masked_lpips_method
 
 OBSERVATION_SCHEMA = pa.schema(
     [

@@ -1,4 +1,4 @@
-"""The terms of the reconstruction objective (paper eq. 5) that this version uses."""
+"""The terms of the reconstruction objective (paper eq. 5) and those that this project adds."""
 
 from __future__ import annotations
 
@@ -41,6 +41,18 @@ def _trimmed_mean(residual: Float[Tensor, " n"], trim: float) -> Float[Tensor, "
     """Mean without the largest `trim` share; 0 of nothing."""
     kept = residual.numel() - int(trim * residual.numel())
     return residual.topk(kept, largest=False).values.mean() if kept else residual.sum()
+
+
+def generator_loss(score_of_rendered: Float[Tensor, ...]) -> Float[Tensor, ""]:
+    """What rendering loses to the discriminator (hinge loss): the mean score of its images, negated."""
+    return -score_of_rendered.mean()
+
+
+def discriminator_loss(
+    score_of_observed: Float[Tensor, ...], score_of_rendered: Float[Tensor, ...]
+) -> Float[Tensor, ""]:
+    """Hinge loss of the discriminator: zero once all observed patches score above 1 and rendered ones below -1."""
+    return torch.relu(1 - score_of_observed).mean() + torch.relu(1 + score_of_rendered).mean()
 
 
 def total_variation(planes: Float[Tensor, "n planes c h w"]) -> Float[Tensor, ""]:

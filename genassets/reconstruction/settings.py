@@ -74,6 +74,7 @@ class LearningRates(_Settings):
 
     latent: PositiveFloat = 0.1
     decoder: PositiveFloat = 4e-3
+    discriminator: PositiveFloat = 1e-4
     field: PositiveFloat = 5e-3
     sharpness: PositiveFloat = 0.05
     background: PositiveFloat = 5e-2
@@ -82,11 +83,17 @@ class LearningRates(_Settings):
 
 
 class LossWeights(_Settings):
-    """Weights of the objective (paper, "Training Details")."""
+    """Weights of the objective (paper, "Training Details").
+
+    Networks of the perceptual and the adversarial term are there only where the weight is not 0.
+    """
 
     rgb: Weight = 1.0
+    perceptual: Weight = 0.0
+    adversarial: Weight = 0.0
     lidar: Weight = 0.01
     surface: Weight = 0.05
+    carving: Weight = 0.0
     total_variation: Weight = 0.02
     kl: Weight = 1e-5
 
@@ -113,6 +120,23 @@ class ReconstructionSettings(_Settings):
     )
     background_share: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.15, description="share of patches placed anywhere in an image rather than on an actor"
+    )
+    object_patch_share: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.25,
+        description="share of steps that also render one actor's box, for the perceptual and the adversarial loss",
+    )
+    object_patch_limit: PositiveInt = Field(
+        default=64,
+        description="feature pixels along a side of such a box; of a larger one a window is rendered",
+    )
+    object_patch_size: Annotated[int, Field(ge=64)] = Field(
+        default=64, description="pixels that its image is resized to before it is compared"
+    )
+    adversarial_start: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.5, description="share of the steps after which the adversarial loss sets in"
+    )
+    mirror_share: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.0, description="chance that a vehicle is learned left for right in a step"
     )
     lidar_rays: Annotated[int, Field(ge=0)] = 256
     lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(

@@ -13,17 +13,29 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
+from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
 from genassets.fields.triplane import half_planes
+from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
+from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.lidar_surface import draw_surface_samples
-from genassets.reconstruction.losses import kl_loss, lidar_loss, rgb_loss, surface_loss, total_variation
+from genassets.reconstruction.losses import (
+    generator_loss,
+    kl_loss,
+    lidar_loss,
+    rgb_loss,
+    surface_loss,
+    total_variation,
+)
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
-from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
+from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
+from genassets.rendering.rays import mirror_where, mirrored
 from genassets.rendering.renderer import (
     ActorFields,
     RenderSettings,
@@ -32,7 +44,9 @@ from genassets.rendering.renderer import (
     cull,
     render_rays,
 )
+from genassets.weights import load_lpips_arrays
 
+PERCEPTUAL_FILE = "lpips-vgg16"
 CURVE_EVERY = 20
 
 Progress = Callable[[float, float, str], None]
@@ -41,11 +55,14 @@ Curve = Callable[[str, int, float], None]
 
 @dataclass(frozen=True)
 class StepResult:
-    """The terms of one step, unweighted, and the actors that it learned."""
+    """The terms of one step, unweighted, the actors that it learned, and pairs of rendered and observed images
+    (n, 3, h, w) that the discriminator compares.
+    """
 
     losses: dict[str, Tensor]
     actors: Tensor
     counts: SampleCounts
+    compared: list[tuple[Tensor, Tensor]]
 
 
 def render_settings(settings: RenderingSettings, exact: bool = False) -> RenderSettings:
@@ -83,7 +100,11 @@ class Trainer:
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
         codes = [model.latent_mean.weight, model.latent_log_variance.weight]
         self.sparse = torch.optim.SparseAdam([{"params": codes, "lr": rates.latent}], betas=(0.9, 0.99))
+        weights = settings.weights
+        self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
+        self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
+        self.symmetric = torch.tensor([CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()])
         views = np.array([max(len(log.observations), 1) for log in data], dtype=np.float64)
         self.log_chance = views / views.sum()
 
@@ -118,6 +139,8 @@ class Trainer:
         self._set_rates()
         self.dense.step()
         self.sparse.step()
+        if self.adversary is not None and "adversarial" in result.losses:
+            self.adversary.learn(result.compared)
         self.step += 1
         return result
 
@@ -137,34 +160,74 @@ class Trainer:
         """
         model, settings = self.model, self.settings
         rendering = render_settings(settings.rendering)
-        culled = cull(batch.rays, model.coarse_actors(), rendering, generator)
-        actors, bystanders = self._split_actors(culled.samples_of_actors(batch.rays))
+        swapped = self._mirrored_actors(generator)
+        rays = mirrored(batch.rays, swapped)
+        culled = cull(rays, model.coarse_actors(), rendering, generator)
+        actors, bystanders = self._split_actors(culled.samples_of_actors(rays))
         latents = model.latents(actors, generator)
         decoded = model.decode(actors, latents.code)
         planes = torch.cat((decoded, self.planes[bystanders].float()))
         fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
         background = model.background_fields(number, self.data[number].occupancy)
-        rendered = render_rays(batch.rays, culled, fields, background, rendering, generator)
-        camera_rays = batch.patches * batch.side**2
-        feature_map = rendered.feature[:camera_rays].reshape(batch.patches, batch.side, batch.side, -1)
-        margin = settings.patch_margin * model.stride
-        image = model.rgb(feature_map.permute(0, 3, 1, 2))
-        height, width = image.shape[-2:]
-        image = image[..., margin : height - margin, margin : width - margin]
+        lidar = slice(batch.camera_rays, None)
+        free_until = torch.zeros(len(rays))
+        free_until[lidar] = batch.lidar_distance - FREE_BEFORE_RETURN
+        rendered = render_rays(rays, culled, fields, background, rendering, generator, free_until)
+        patch_rays = batch.patches * batch.side**2
+        image = self._image(rendered.feature[:patch_rays], batch.side, batch.side)
         losses = {
             "rgb": rgb_loss(image, batch.pixels),
             "kl": kl_loss(latents.mean, latents.log_variance),
             "total_variation": total_variation(decoded),
         }
         if len(batch.lidar_distance):
-            distance = rendered.distance[camera_rays:]
-            losses["lidar"] = lidar_loss(distance, batch.lidar_distance, settings.lidar_trim)
-        samples = draw_surface_samples(self.data[number].returns, actors, settings.surface_samples, generator)
+            losses["lidar"] = lidar_loss(rendered.distance[lidar], batch.lidar_distance, settings.lidar_trim)
+            losses["carving"] = rendered.in_free_space[lidar].mean()
+        count = settings.surface_samples if settings.weights.surface else 0
+        samples = draw_surface_samples(self.data[number].returns, actors, count, generator)
         if len(samples.position):
-            sdf, _ = actor_distance(samples.position, samples.actor, fields)
+            position = mirror_where(samples.position, swapped[samples.actor])
+            sdf, _ = actor_distance(position, samples.actor, fields)
             on_surface, free = sdf.tensor_split([samples.returns])
             losses["surface"] = surface_loss(on_surface, free, samples.clearance, settings.lidar_trim)
-        return StepResult(losses, actors, rendered.counts), fields
+        compared = self._compared(rendered.feature[patch_rays : batch.camera_rays], image, batch)
+        if compared and self.perceptual is not None:
+            distances = torch.cat([self.perceptual(shown, observed) for shown, observed in compared])
+            losses["perceptual"] = distances.mean()
+        if (
+            compared
+            and self.adversary is not None
+            and self.step >= settings.adversarial_start * settings.steps
+        ):
+            losses["adversarial"] = generator_loss(self.adversary.scores(shown for shown, _ in compared))
+        return StepResult(losses, actors, rendered.counts, compared), fields
+
+    def _image(self, feature: Tensor, rows: int, columns: int) -> Tensor:
+        """Images (n, 3, h, w) of feature maps rows x columns, their margin cut off."""
+        image = self.model.rgb(feature.reshape(-1, rows, columns, feature.shape[-1]).permute(0, 3, 1, 2))
+        margin = self.settings.patch_margin * self.model.stride
+        height, width = image.shape[-2:]
+        return image[..., margin : height - margin, margin : width - margin]
+
+    def _compared(self, object_feature: Tensor, image: Tensor, batch: Batch) -> list[tuple[Tensor, Tensor]]:
+        """What networks compare: patches that are large enough for them, and the resized object patch."""
+        pairs = [(image, batch.pixels)] if min(image.shape[-2:]) >= MINIMUM_SIDE else []
+        if (shown := batch.object_patch) is not None:
+            images = self._image(object_feature, shown.rows, shown.columns), shown.pixels
+            size = (self.settings.object_patch_size,) * 2
+            rendered, observed = (
+                F.interpolate(i, size, mode="bilinear", align_corners=False) for i in images
+            )
+            pairs.append((rendered, observed))
+        return pairs
+
+    def _mirrored_actors(self, generator: torch.Generator | None) -> Tensor:
+        """Which actors of the library this step learns left for right."""
+        if generator is None or not self.settings.mirror_share:
+            return torch.zeros_like(self.symmetric)
+        return self.symmetric & (
+            torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
+        )
 
     def _remember(self, actors: Tensor, fields: ActorFields) -> None:
         """Keep what a step decoded: planes for when its actors are bystanders, one actor's coarse distance."""
@@ -208,6 +271,7 @@ class Trainer:
             "model": self.model.state_dict(),
             "dense": self.dense.state_dict(),
             "sparse": self.sparse.state_dict(),
+            "adversary": None if self.adversary is None else self.adversary.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -218,6 +282,8 @@ class Trainer:
         self.model.load_state_dict(state["model"])
         self.dense.load_state_dict(state["dense"])
         self.sparse.load_state_dict(state["sparse"])
+        if self.adversary is not None:
+            self.adversary.restore(state["adversary"])
 
 
 @torch.no_grad()

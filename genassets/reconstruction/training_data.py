@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -41,6 +42,9 @@ LIDAR_SHARE_THROUGH_ACTORS = 0.35
 """Shares of a batch's LiDAR rays that end on an actor, and that went through an actor's box unhindered and show
 where it is not; the rest keeps the background in place."""
 
+FREE_BEFORE_RETURN = 0.1
+"""Metres before a LiDAR return up to which its ray is taken to be free."""
+
 LIDAR_BEHIND = 2.0
 """Metres that a LiDAR ray is followed beyond its return: weight found there is an error to learn from."""
 
@@ -68,17 +72,34 @@ class TrainingLog:
 
 
 @dataclass(frozen=True)
-class Batch:
-    """Rays of one step: first patches x side x side camera rays, then LiDAR rays, with what was observed.
+class ObjectPatch:
+    """One actor's box in an image, or a window of it: rows x columns rays with margin, pixels (1, 3, h, w)."""
 
-    pixels (patches, 3, h, w) in [0, 1]; lidar_distance (rays,) in metres.
+    rows: int
+    columns: int
+    pixels: Float[Tensor, "1 3 h w"]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Rays of one step and what was observed along them.
+
+    First patches x side x side camera rays, then those of one actor's box, then LiDAR rays. pixels
+    (patches, 3, h, w) in [0, 1]; lidar_distance (rays,) in metres.
     """
 
     rays: Rays
     patches: int
     side: int
     pixels: Float[Tensor, "patches 3 h w"]
+    object_patch: ObjectPatch | None
     lidar_distance: Float[Tensor, " lidar"]
+
+    @property
+    def camera_rays(self) -> int:
+        """Rays before the first LiDAR ray."""
+        on_object = 0 if self.object_patch is None else self.object_patch.rows * self.object_patch.columns
+        return self.patches * self.side**2 + on_object
 
 
 def training_frames(
@@ -252,22 +273,56 @@ def draw_batch(
     of_view = np.bincount(owner, chance, minlength=len(data.views)) + 1e-9
     count = min(settings.views_at_once, len(data.views))
     chosen = rng.choice(len(data.views), count, replace=False, p=of_view / of_view.sum())
+
+    def draw_observation(views: np.ndarray) -> Observation | None:
+        candidates = np.flatnonzero(np.isin(owner, views))
+        if not len(candidates):
+            return None
+        share = chance[candidates] / chance[candidates].sum()
+        return data.observations[int(rng.choice(candidates, p=share))]
+
     for patch in range(settings.patches):
         number = int(chosen[patch % count])
-        candidates = np.flatnonzero(owner == number)
-        bounds = None
-        if len(candidates) and rng.random() >= settings.background_share:
-            share = chance[candidates] / chance[candidates].sum()
-            bounds = data.observations[int(rng.choice(candidates, p=share))].bounds
+        shown = draw_observation(chosen[patch % count]) if rng.random() >= settings.background_share else None
+        bounds = shown.bounds if shown else None
         view = data.views[number]
         column, row = _place_patch(view, bounds, settings.patch_size, stride, rng)
         parts.append(patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride))
         x, y, extent = column * stride, row * stride, settings.patch_size * stride
         targets.append(data.images[number][y : y + extent, x : x + extent])
     pixels = torch.stack(targets).permute(0, 3, 1, 2).float() / 255
+    object_patch = None
+    compared = settings.weights.perceptual or settings.weights.adversarial
+    shown = draw_observation(chosen) if compared and rng.random() < settings.object_patch_share else None
+    if shown:
+        cast, object_patch = _object_patch(data, shown, settings, stride, rng)
+        parts.append(cast)
     met = np.unique(np.concatenate([part.hits.actor.numpy() for part in parts]))
     lidar, distance = _draw_lidar(data, settings.lidar_rays, met, rng)
-    return Batch(concatenate_rays([*parts, *lidar]), settings.patches, side, pixels, distance)
+    return Batch(concatenate_rays([*parts, *lidar]), settings.patches, side, pixels, object_patch, distance)
+
+
+def _object_patch(
+    data: TrainingLog,
+    shown: Observation,
+    settings: ReconstructionSettings,
+    stride: int,
+    rng: np.random.Generator,
+) -> tuple[Rays, ObjectPatch]:
+    """The feature pixels of an actor's box; of a box beyond `object_patch_limit` a window inside it."""
+    view, margin = data.views[shown.view], settings.patch_margin
+    spans = []
+    for axis, extent in enumerate((view.intrinsics.width // stride, view.intrinsics.height // stride)):
+        low = min(max(math.floor(shown.bounds[axis] / stride), 0), extent - 1)
+        high = max(min(math.ceil(shown.bounds[axis + 2] / stride), extent), low + 1)
+        length = min(high - low, settings.object_patch_limit)
+        low = int(rng.integers(low, high - length + 1))
+        spans.append((low, low + length))
+    (x0, x1), (y0, y1) = spans
+    rays = region_rays(view, (x0 - margin, y0 - margin, x1 + margin, y1 + margin), stride)
+    pixels = data.images[shown.view][y0 * stride : y1 * stride, x0 * stride : x1 * stride]
+    pixels = pixels.permute(2, 0, 1)[None].float() / 255
+    return rays, ObjectPatch(y1 - y0 + 2 * margin, x1 - x0 + 2 * margin, pixels)
 
 
 def patch_rays(view: View, column: int, row: int, size: int, margin: int, stride: int) -> Rays:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -85,6 +85,21 @@ def cast_rays(
         torch.as_tensor(ray, device=device), torch.as_tensor(actor, device=device), *(cast(a) for a in rest)
     )
     return Rays(cast(origins), cast(directions), cast(limit), hits)
+
+
+def mirrored(rays: Rays, chosen: Bool[Tensor, " actors"]) -> Rays:
+    """The rays as they would meet the chosen actors (by index in the library) were those their mirror images.
+
+    Left and right change places in the box frame; distances along rays stay, because boxes are symmetric.
+    """
+    swap = chosen[rays.hits.actor]
+    origin, direction = mirror_where(rays.hits.origin, swap), mirror_where(rays.hits.direction, swap)
+    return replace(rays, hits=replace(rays.hits, origin=origin, direction=direction))
+
+
+def mirror_where(vectors: Float[Tensor, "n 3"], swap: Bool[Tensor, " n"]) -> Float[Tensor, "n 3"]:
+    """Vectors in box frames, left for right where `swap` says so."""
+    return torch.where(swap[:, None], vectors * vectors.new_tensor((1, -1, 1)), vectors)
 
 
 def concatenate_rays(parts: Sequence[Rays]) -> Rays:

@@ -121,11 +121,14 @@ class SampleCounts:
 class Rendered:
     """What rays see: feature, expected distance in metres, opacity; both without what of the background lies
     beyond background_far, which is sky.
+
+    in_free_space is the sum of squared weights nearer than the `free_until` that the renderer was given.
     """
 
     feature: Float[Tensor, "rays channels"]
     distance: Float[Tensor, " rays"]
     opacity: Float[Tensor, " rays"]
+    in_free_space: Float[Tensor, " rays"]
     counts: SampleCounts
 
 
@@ -159,10 +162,12 @@ def render_rays(
     background: BackgroundFields | None,
     settings: RenderSettings,
     generator: torch.Generator | None = None,
+    free_until: Float[Tensor, " rays"] | None = None,
 ) -> Rendered:
     """Render features and distances along rays through all actors that they meet and the background.
 
-    Without a background, rays see actors alone.
+    Without a background, rays see actors alone. free_until: up to which distance in metres each ray is known
+    to meet nothing.
     """
     occupied = culled.samples
     static = _background_samples(rays, background, settings, generator)
@@ -202,10 +207,15 @@ def render_rays(
     solid = (~sky[order]).to(weight.dtype)
     geometry = torch.stack((distance * solid, solid), dim=-1)
     sums = accumulate(weight, geometry, ray, len(rays))
+    in_free_space = torch.zeros_like(sums[:, 0])
+    if free_until is not None:
+        early = weight * (distance < free_until[ray])
+        in_free_space = accumulate(weight, early[:, None], ray, len(rays))[:, 0]
     return Rendered(
         accumulate(weight, feature[order], ray, len(rays)),
         sums[:, 0],
         sums[:, 1],
+        in_free_space,
         SampleCounts(culled.in_boxes, len(occupied.hit), background_count, len(ray)),
     )
 

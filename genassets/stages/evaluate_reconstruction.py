@@ -81,11 +81,11 @@ def run(
     """
     import pyarrow.parquet as pq
 
-    from genassets.evaluation.lpips import Lpips
     from genassets.evaluation.sparse_view import Comparison, evaluate_log
     from genassets.evaluation.sparse_view_tables import actor_table, means, observation_table, view_table
     from genassets.evaluation.viewpoint import ViewThresholds
     from genassets.export.picture_list import PictureList
+    from genassets.perceptual.lpips import Lpips
     from genassets.reconstruction.scene_renderer import SceneRenderer
     from genassets.stages.ingested import open_ingested
     from genassets.weights import load_lpips_arrays
@@ -285,6 +285,7 @@ STAGE = Stage(
         "genassets.fields",
         "genassets.driving",
         "genassets.geometry",
+        "genassets.perceptual",
         "genassets.weights",
     ),
     run=run,

@@ -40,6 +40,11 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
     ]
 
 
+def needed_files(config: ReconstructConfig) -> dict[str, str]:
+    """The pinned files that training cannot do without."""
+    return {"lpips-vgg16": "reconstruct.weights.perceptual=0"} if config.weights.perceptual else {}
+
+
 STAGE = Stage(
     name="reconstruct",
     version=1,
@@ -51,9 +56,12 @@ STAGE = Stage(
         "genassets.fields",
         "genassets.driving",
         "genassets.geometry",
+        "genassets.perceptual",
+        "genassets.weights",
     ),
     run=run,
     sharded=False,
     summary="Learn latents, decoder, fields and backgrounds",
     runtime_only=frozenset({"checkpoint_every"}),
+    pretrained=needed_files,
 )
