@@ -94,7 +94,7 @@ class LossWeights(_Settings):
     lidar: Weight = 0.01
     surface: Weight = 0.05
     carving: Weight = 0.0
-    total_variation: Weight = 0.02
+    total_variation: Weight = 0.05
     kl: Weight = 1e-5
 
 
