@@ -165,7 +165,9 @@ def test_observations_fall_into_groups(table: pd.DataFrame) -> None:
 
 
 def test_means_keep_groups_apart_and_state_gains(table: pd.DataFrame) -> None:
-    rows = {(m.setting, m.class_name, m.metric, m.method.split(";")[0]): m for m in means(table)}
+    rows = {
+        (m.setting, m.class_name, m.metric, m.method.split(";")[0]): m for m in means(table, "sparse_view")
+    }
     assert rows["sparse_view/all", "all", "psnr", "model"].n == 2
     assert rows["sparse_view/moved", "Car", "psnr", "model"].n == 1
     assert rows["sparse_view/unseen", "Bus", "psnr", "model"].value == pytest.approx(20.0, abs=1e-4)
@@ -179,7 +181,7 @@ def test_means_keep_groups_apart_and_state_gains(table: pd.DataFrame) -> None:
 
 def test_gain_over_a_worse_baseline_is_positive(log: Log) -> None:
     scored, _ = score(log, TRAINING[:1], HELD_OUT[:2], frozenset({"a"}), error=0.02)
-    rows = means(observation_table(scored).to_pandas())
+    rows = means(observation_table(scored).to_pandas(), "sparse_view")
     gains = {(m.setting, m.metric, m.method.split(";")[0]): m.value for m in rows}
     gain = gains["sparse_view/moved", "psnr_gain", "model over nearest_crop"]
     assert gain == pytest.approx(
@@ -202,7 +204,7 @@ def test_views_without_a_mask_decide_the_group_but_are_no_crops(log: Log) -> Non
     assert seen["bare"].difference is not None and seen["bare"].difference.angle_degrees == 90.0
     table = observation_table(scored).to_pandas()
     assert table.loc[table["actor_id"] == "a", "crop_frame"].tolist() == [2, 2, 2]
-    psnr = {(m.setting, m.method.split(";")[0]): m for m in means(table) if m.metric == "psnr"}
+    psnr = {(m.setting, m.method.split(";")[0]): m for m in means(table, "sparse_view") if m.metric == "psnr"}
     # The compared means hold the same observations for every predictor.
     assert {psnr["sparse_view/all", name].n for name in ("model", "mean_colour", "nearest_crop")} == {1}
     assert "no baselines" in psnr["sparse_view/no_crop", "model"].method
@@ -244,6 +246,21 @@ def test_training_views_are_the_visible_boxes_of_every_training_camera(tmp_path:
     assert [o.actor_id for o in seen.held_out] == ["held out"]
 
 
+def test_a_novel_camera_tests_at_frames_at_which_others_train(tmp_path: Path) -> None:
+    kept = {"kept": True, "reason": None, "segmenter": "truth", "mask_rle": [0, 1920 * 1080]}
+    rows = [
+        table_row(actor_id=f"{camera} {frame}", camera=f"{camera}_camera", frame=frame, **kept)
+        for camera in ("front", "front_left", "left")
+        for frame in (0, 1)
+    ]
+    write_object_table(tmp_path / "objects.parquet", rows)
+    novel = Split(camera="front_left_camera", every=1, train_cameras=("front_camera",))
+    seen = _seen(tmp_path, EvaluateReconstructionConfig(split=novel))
+    assert [o.actor_id for o in seen.training] == ["front 0", "front 1"]
+    assert [o.actor_id for o in seen.held_out] == ["front_left 0", "front_left 1"]
+    assert novel.setting == "novel_camera"
+
+
 def test_without_training_masks_nothing_is_rendered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     held_out = {"frame": 1, "camera": "front_camera", "kept": True, "reason": None, "segmenter": "truth"}
     write_object_table(tmp_path / "objects.parquet", [table_row(), table_row(**held_out)])
@@ -255,7 +272,7 @@ def test_without_training_masks_nothing_is_rendered(tmp_path: Path, monkeypatch:
 
 
 def test_means_of_nothing_are_none() -> None:
-    assert means(observation_table([]).to_pandas()) == []
+    assert means(observation_table([]).to_pandas(), "sparse_view") == []
 
 
 def test_actor_table_has_one_row_an_actor_and_predictor(table: pd.DataFrame) -> None:
@@ -296,7 +313,7 @@ def test_pictures_show_one_view_an_actor_best_first(log: Log) -> None:
 
 def test_a_smaller_lpips_is_a_gain(table: pd.DataFrame) -> None:
     lpips = {"model": 0.1, "mean_colour": 0.4, "nearest_crop": 0.05}
-    rows = means(table.assign(lpips=table["predictor"].map(lpips)))
+    rows = means(table.assign(lpips=table["predictor"].map(lpips)), "sparse_view")
     gains = {
         m.method.split(";")[0]: m.value
         for m in rows

@@ -87,7 +87,7 @@ def test_malformed_yaml(text: str, message: str) -> None:
 
 
 def test_missing_file_lists_what_is_there(tmp_path: Path) -> None:
-    with pytest.raises(SpecError, match=r"known by name: demo, pandaset_002"):
+    with pytest.raises(SpecError, match=r"known by name: demo, pandaset_002, pandaset_002_novel_camera"):
         load_experiment("demmo", configs(CATALOG))
     with pytest.raises(SpecError, match="no such file"):
         load_experiment(str(tmp_path / "x.yaml"), configs(CATALOG))
@@ -137,6 +137,9 @@ def test_split_is_shared_and_no_stage_has_its_own() -> None:
 
 def test_split_counts_frames_by_hand() -> None:
     assert [frame for frame in range(8) if Split(every=3, offset=1).is_training(frame)] == [1, 4, 7]
+    sparse = Split(every=2)
+    assert [sparse.tests("front_camera", frame) for frame in range(3)] == [False, True, False]
+    assert not sparse.tests("left_camera", 1)
     with pytest.raises(ValueError, match="offset is 2; expected less than every"):
         Split(every=2, offset=2)
 

@@ -141,15 +141,16 @@ def actor_table(observations: pd.DataFrame) -> pd.DataFrame:
     return table.agg(observations=("frame", "size"), moved=("is_moved", "sum"), **columns).reset_index()
 
 
-def means(observations: pd.DataFrame) -> list[Mean]:
+def means(observations: pd.DataFrame, setting: str) -> list[Mean]:
     """Means over observations by group, log and class, for the model and for the baselines, and the model's
     gains.
 
-    Settings are `sparse_view/moved`, `/same` and `/all` (both together), in which every predictor has the
-    same observations, and two with the model alone: `/no_crop` (actors seen in training without a kept mask)
-    and `/unseen` (actors without any training view). The split is `test`, or `test/<log>` for one log where
-    there are several. Gains are means over observations of the model's value less the baseline's, of LPIPS
-    the other way round, so that a positive gain is always for the better.
+    `setting` names what was held out (`Split.setting`). Rows are those of `<setting>/moved`, `/same` and `/all`
+    (both together), in which every predictor has the same observations, and two with the model alone:
+    `/no_crop` (actors seen in training without a kept mask) and `/unseen` (actors without any training view).
+    The split is `test`, or `test/<log>` for one log where there are several. Gains are means over
+    observations of the model's value less the baseline's, of LPIPS the other way round, so that a positive
+    gain is always for the better.
     """
     if observations.empty:
         return []
@@ -162,7 +163,7 @@ def means(observations: pd.DataFrame) -> list[Mean]:
         for split, class_name, subset in _subsets(part):
             rows.extend(
                 _means_of(
-                    subset, f"sparse_view/{group}", split, class_name, mask_rule + MODEL_ALONE.get(group, "")
+                    subset, f"{setting}/{group}", split, class_name, mask_rule + MODEL_ALONE.get(group, "")
                 )
             )
     return rows

@@ -30,7 +30,7 @@ NAMES = {
     "f_score": "F-score",
     "chamfer": "Chamfer, m",
 }
-GROUP_ORDER = tuple(f"sparse_view/{group}" for group in ("moved", "same", "all", "no_crop", "unseen"))
+GROUP_ORDER = ("moved", "same", "all", "no_crop", "unseen")
 PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
 
 
@@ -79,20 +79,20 @@ def stage_tables(stage: str, rows: Sequence[MetricRow]) -> list[MetricTable]:
 
 
 def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
-    """The sparse-view evaluation: the model beside its baselines by group, class and log, then gains and
+    """The comparison of held-out views: the model beside its baselines by group, class and log, then gains and
     counts.
     """
     gains = [row for row in rows if row["metric"].endswith("_gain")]
     counts = [row for row in rows if row["method"].startswith("count")]
     means = [row for row in rows if row not in gains and row not in counts]
     overall = [row for row in means if row["class"] == "all" and row["split"] == "test"]
-    by_class = [row for row in means if row["class"] != "all" and row["setting"] == "sparse_view/all"]
-    by_log = [row for row in means if row["split"] != "test" and row["setting"] == "sparse_view/all"]
+    by_class = [row for row in means if row["class"] != "all" and _group(row["setting"]) == "all"]
+    by_log = [row for row in means if row["split"] != "test" and _group(row["setting"]) == "all"]
     gain_rows = [row for row in gains if row["class"] == "all" and row["split"] == "test"]
     details = [
         row
         for row in means
-        if (row["class"] != "all" or row["split"] != "test") and row["setting"] != "sparse_view/all"
+        if (row["class"] != "all" or row["split"] != "test") and _group(row["setting"]) != "all"
     ]
     tables = [
         metric_table("By viewpoint group", overall, ("setting", "method")),
@@ -107,6 +107,11 @@ def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
         ),
     ]
     return _without_repeated_notes(tables)
+
+
+def _group(setting: str) -> str:
+    """The group of viewpoints, such as "moved" of "sparse_view/moved"."""
+    return setting.rpartition("/")[2]
 
 
 def _without_repeated_notes(tables: Iterable[MetricTable]) -> list[MetricTable]:
@@ -217,7 +222,8 @@ def _direction(measure: str) -> int:
 def _group_rank(key: tuple[str, ...], lines: Mapping[tuple[str, ...], object]) -> tuple[int, int]:
     """View groups in their own order, all others in the order in which they first appear."""
     groups = list(dict.fromkeys(other[:-1] or other for other in lines))
-    known = GROUP_ORDER.index(key[0]) if key[0] in GROUP_ORDER else len(GROUP_ORDER)
+    group = _group(key[0])
+    known = GROUP_ORDER.index(group) if group in GROUP_ORDER else len(GROUP_ORDER)
     return known, groups.index(key[:-1] or key)
 
 

@@ -217,7 +217,7 @@ def _headlines(metrics: list[dict[str, Any]]) -> list[Headline]:
     there are any, else for all.
     """
     settings = {row["setting"] for row in metrics if row["metric"] == "psnr"}
-    setting = next((s for s in ("sparse_view/moved", "sparse_view/all") if s in settings), None)
+    setting = next((s for end in ("/moved", "/all") for s in sorted(settings) if s.endswith(end)), None)
     if setting is None:
         return []
     seen = "moved views" if setting.endswith("moved") else "all views"

@@ -13,16 +13,17 @@ CameraName = Literal[
 
 
 class Split(BaseModel):
-    """The sparse-view split: every ``every``-th frame trains, the others test.
+    """Which images train and which test, by camera and frame.
 
-    Training data are the frames with ``is_training`` of ``train_cameras``; test data are the other
-    frames of ``camera`` (paper, section 4: every 10th front frame at 10 Hz trains).
+    Images of ``train_cameras`` train at every ``every``-th frame; all other images of ``camera`` test. Where
+    ``camera`` is one of the training cameras that is the paper's sparse-view setting (every 10th front frame at
+    10 Hz trains), else its novel-camera setting (all front frames train, all front-left frames test).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     camera: CameraName = Field(
-        default="front_camera", description="Camera whose held-out frames are the test set."
+        default="front_camera", description="Camera whose images test, save those that train."
     )
     every: int = Field(default=2, ge=1, description="One frame in this many trains.")
     offset: int = Field(default=0, ge=0, description="Frame index of the first training frame.")
@@ -35,6 +36,19 @@ class Split(BaseModel):
         if self.offset >= self.every:
             raise ValueError(f"offset is {self.offset}; expected less than every, which is {self.every}")
         return self
+
+    @property
+    def setting(self) -> Literal["sparse_view", "novel_camera"]:
+        """The paper's name of what is measured."""
+        return "sparse_view" if self.camera in self.train_cameras else "novel_camera"
+
+    def trains(self, camera: str, frame: int) -> bool:
+        """Whether an image is learned from."""
+        return camera in self.train_cameras and self.is_training(frame)
+
+    def tests(self, camera: str, frame: int) -> bool:
+        """Whether an image is held out and compared."""
+        return camera == self.camera and not self.trains(camera, frame)
 
     def is_training(self, frame: int) -> bool:
         """Whether a frame index belongs to the training frames."""

@@ -30,7 +30,7 @@ WHOLE_FRAME_WIDTH = 480
 
 
 class EvaluateReconstructionConfig(BaseModel):
-    """Settings of the sparse-view evaluation."""
+    """Settings of the comparison of held-out views."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -130,7 +130,8 @@ def run(
     _write_skipped(skipped, out / "skipped.parquet")
     _picture_actors(scored, config.pictured_actors, pictures)
     pictures.write()
-    return [Metric(*mean) for mean in means(observations)] + _counts(scored, skipped)
+    setting = config.split.setting
+    return [Metric(*mean) for mean in means(observations, setting)] + _counts(scored, skipped, setting)
 
 
 @dataclass(frozen=True)
@@ -162,8 +163,8 @@ def _seen(path: Path, config: EvaluateReconstructionConfig) -> _Seen:
     seen = _Seen([], [], [])
     for row in rows[rows["kept"] | visible].itertuples(index=False):
         frame, camera = int(cast(int, row.frame)), str(row.camera)
-        trains = split.is_training(frame)
-        if camera not in split.train_cameras if trains else camera != split.camera:
+        trains = split.trains(camera, frame)
+        if not trains and not split.tests(camera, frame):
             continue
         view = View(
             log=str(row.log),
@@ -186,18 +187,18 @@ def _seen(path: Path, config: EvaluateReconstructionConfig) -> _Seen:
     return seen
 
 
-def _counts(scored: list[Scored], skipped: list[Skipped]) -> list[Metric]:
+def _counts(scored: list[Scored], skipped: list[Skipped], setting: str) -> list[Metric]:
     """How many observations and actors stand behind the means, and how many were left out and why."""
     rows = []
     for group in ("moved", "same", "no_crop", "unseen"):
         items = [item for item in scored if item.group == group]
         actors = {(item.observation.log, item.observation.actor_id) for item in items}
-        setting = f"sparse_view/{group}"
-        rows.append(Metric(setting, "test", "all", "observations", len(items), len(items), "count"))
-        rows.append(Metric(setting, "test", "all", "actors", len(actors), len(actors), "count"))
+        name = f"{setting}/{group}"
+        rows.append(Metric(name, "test", "all", "observations", len(items), len(items), "count"))
+        rows.append(Metric(name, "test", "all", "actors", len(actors), len(actors), "count"))
     for reason in ("not_in_library", "mask_too_small"):
         n = sum(item.reason == reason for item in skipped)
-        rows.append(Metric("sparse_view/skipped", "test", "all", reason, n, n, "count of observations"))
+        rows.append(Metric(f"{setting}/skipped", "test", "all", reason, n, n, "count of observations"))
     return rows
 
 
