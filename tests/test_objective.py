@@ -72,6 +72,7 @@ def test_the_discriminator_sees_patches_of_70_pixels() -> None:
     assert scores.shape == (1, 1, 14, 14)
     # Group normalisation looks at the whole image; what the convolutions alone reach is tested without it.
     for layer in network.layers:
+        assert isinstance(layer, torch.nn.Sequential)
         layer[1] = torch.nn.Identity()
     network(image)[0, 0, 7, 7].backward()
     assert image.grad is not None

@@ -26,6 +26,7 @@ from genassets.cli.report import report
 from genassets.cli.resume import resume
 from genassets.cli.run import run
 from genassets.cli.schema import schema
+from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.verify import verify
 from genassets.errors import EnvironmentProblem, GenAssetsError
@@ -76,6 +77,7 @@ app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
+app.command("speed-error")(speed_error)
 app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")
 

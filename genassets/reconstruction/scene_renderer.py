@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +23,14 @@ from genassets.reconstruction.training import render_settings
 from genassets.reconstruction.training_data import region_rays
 from genassets.rendering.occupancy import cell_centres
 from genassets.rendering.rays import cast_rays
-from genassets.rendering.renderer import ActorFields, actor_distance, cull, padded_half_size, render_rays
+from genassets.rendering.renderer import (
+    ActorFields,
+    RenderSettings,
+    actor_distance,
+    cull,
+    padded_half_size,
+    render_rays,
+)
 
 RAYS_AT_ONCE = 8192
 
@@ -36,12 +44,34 @@ class ActorView:
     depth: NDArray[np.float32]
 
 
-class SceneRenderer:
-    """Renders logs and actors of a library; keeps the planes of the last actors that it decoded."""
+@dataclass(frozen=True)
+class RegionView:
+    """A region of a scene: rgb (h, w, 3) in [0, 1], and in feature pixels opacity and depth (rows, columns) in
+    metres along the ray, not divided by opacity; neither counts the sky.
+    """
 
-    def __init__(self, library: AssetLibrary, exact: bool = False) -> None:
+    rgb: NDArray[np.float32]
+    opacity: NDArray[np.float64]
+    depth: NDArray[np.float64]
+
+
+class SceneRenderer:
+    """Renders logs and actors of a library; keeps the planes of the last actors that it decoded.
+
+    settings: how samples are placed and culled, by default as the library says. keep: what is done to an
+    actor's decoded planes before they are kept. A library whose model is in float64 is rendered in it.
+    """
+
+    def __init__(
+        self,
+        library: AssetLibrary,
+        settings: RenderSettings | None = None,
+        keep: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+    ) -> None:
         self.library = library
-        self._settings = render_settings(library.settings.rendering, exact)
+        self._settings = settings or render_settings(library.settings.rendering)
+        self._keep = keep
+        self._dtype = next(library.model.parameters()).dtype
         # Feature pixels rendered around a region, so that the image network sees no border inside it.
         self._context = library.model.rgb.reach
         self._planes = lru_cache(maxsize=256)(self._decode)
@@ -68,11 +98,17 @@ class SceneRenderer:
         scale, stride = self.library.settings.image_scale, self.library.model.stride
         return make_view(log, camera, frame, index, scene, scale, stride)
 
-    @torch.no_grad()
     def render_image(
         self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
     ) -> NDArray[np.float32]:
         """The composited scene (h, w, 3) in [0, 1], in a region x0, y0, x1, y1 of the rendered image."""
+        return self.render_region(log, camera, frame, region).rgb
+
+    @torch.no_grad()
+    def render_region(
+        self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None
+    ) -> RegionView:
+        """The composited scene in a region x0, y0, x1, y1 of the rendered image, the whole by default."""
         view = self.view(log, camera, frame)
         x0, y0, x1, y1 = region or (0, 0, view.intrinsics.width, view.intrinsics.height)
         stride, context = self.library.model.stride, self._context
@@ -85,15 +121,18 @@ class SceneRenderer:
         coarse = self.library.model.coarse_actors()
         strips = []
         for top in range(fy0, fy1, rows_at_once):
-            rays = region_rays(view, (fx0, top, fx1, min(top + rows_at_once, fy1)), stride)
+            rows = (fx0, top, fx1, min(top + rows_at_once, fy1))
+            rays = region_rays(view, rows, stride, self._dtype)
             culled = cull(rays, coarse, self._settings)
             met = torch.nonzero(culled.samples_of_actors(rays))[:, 0].tolist()
             fields = self._fields(met or [0])  # one stands in where none is met
-            strips.append(render_rays(rays, culled, fields, background, self._settings).feature)
-        feature_map = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
-        image = self.library.model.rgb(feature_map).clamp(0, 1)[0].permute(1, 2, 0).numpy()
+            out = render_rays(rays, culled, fields, background, self._settings)
+            strips.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
+        maps = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
+        image = self.library.model.rgb(maps[:, :-2]).clamp(0, 1)[0].permute(1, 2, 0).float().numpy()
         left, top = x0 - fx0 * stride, y0 - fy0 * stride
-        return image[top : top + y1 - y0, left : left + x1 - x0]
+        inner = maps[0, -2:, context : fy1 - fy0 - context, context : fx1 - fx0 - context].double().numpy()
+        return RegionView(image[top : top + y1 - y0, left : left + x1 - x0], inner[0], inner[1])
 
     @torch.no_grad()
     def render_actor(
@@ -161,4 +200,4 @@ class SceneRenderer:
 
     def _decode(self, actor: int) -> Float[Tensor, "3 channels height width"]:
         index = torch.tensor([actor])
-        return self.library.model.decode(index, self.library.model.latents(index).code)[0]
+        return self._keep(self.library.model.decode(index, self.library.model.latents(index).code)[0])

@@ -65,7 +65,7 @@ class StepResult:
     compared: list[tuple[Tensor, Tensor]]
 
 
-def render_settings(settings: RenderingSettings, exact: bool = False) -> RenderSettings:
+def render_settings(settings: RenderingSettings) -> RenderSettings:
     """The renderer's settings from those of the spec."""
     return RenderSettings(
         settings.actor_step,
@@ -76,7 +76,6 @@ def render_settings(settings: RenderingSettings, exact: bool = False) -> RenderS
         settings.background_far,
         settings.sky_samples,
         settings.weight_threshold,
-        exact,
     )
 
 

@@ -332,12 +332,16 @@ def patch_rays(view: View, column: int, row: int, size: int, margin: int, stride
     )
 
 
-def region_rays(view: View, region: tuple[int, int, int, int], stride: int) -> Rays:
+def region_rays(
+    view: View, region: tuple[int, int, int, int], stride: int, dtype: torch.dtype = torch.float32
+) -> Rays:
     """Rays of a region x0, y0, x1, y1 of feature pixels, row by row; it may reach outside the image."""
     origins, directions = view.rays(pixel_centres(*region) * stride)
     x0, y0, x1, y1 = (edge * stride for edge in region)
     actors = view.actors_in((x0, y0, x1, y1))
-    return cast_rays(origins, directions, actors.index.tolist(), actors.scene_from_box, actors.sizes)
+    return cast_rays(
+        origins, directions, actors.index.tolist(), actors.scene_from_box, actors.sizes, dtype=dtype
+    )
 
 
 def _place_patch(

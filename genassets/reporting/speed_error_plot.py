@@ -1,0 +1,54 @@
+"""The plot of rendering's speed against its error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+
+def write_speed_error_plot(points: pd.DataFrame, path: Path) -> None:
+    """Draw every point of `evaluation.speed_error.measure`, with its columns pareto and knee, as a PNG.
+
+    Seconds run to the right, dB to the exact mode upwards: good is up and to the left. The exact mode itself has
+    no error and is left out.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    shown = points[points["psnr_to_exact"] < points["psnr_to_exact"].max()]
+    for lever, part in shown.groupby("lever", sort=False):
+        axes.plot(part["seconds"], part["psnr_to_exact"], "o", markersize=5, label=lever)
+    rows: Iterable[Any] = shown.itertuples()
+    for row in rows:
+        axes.annotate(
+            row.value,
+            (row.seconds, row.psnr_to_exact),
+            textcoords="offset points",
+            xytext=(4, 3),
+            fontsize=6.5,
+            color="#555555",
+        )
+    front = shown[shown["pareto"]].sort_values("seconds")
+    axes.step(front["seconds"], front["psnr_to_exact"], where="post", color="#888888", linewidth=1)
+    best = shown[shown["knee"]]
+    axes.plot(
+        best["seconds"],
+        best["psnr_to_exact"],
+        "o",
+        markersize=13,
+        markerfacecolor="none",
+        color="black",
+        label="knee",
+    )
+    axes.set_xscale("log")
+    axes.set_xlabel("seconds for all crops")
+    axes.set_ylabel("PSNR to the exact mode, dB")
+    axes.grid(True, which="both", linewidth=0.3)
+    axes.legend(fontsize=7, ncols=2)
+    figure.savefig(path, dpi=110)
