@@ -255,6 +255,8 @@ STAGE = Stage(
         "genassets.fields",
         "genassets.driving",
         "genassets.geometry",
+        "genassets.perceptual",
+        "genassets.weights",
         "genassets.stages.ingested",
     ),
     run=run,
