@@ -170,7 +170,7 @@ def test_a_step_that_is_not_finite_changes_nothing(
 
 def test_a_step_learns_from_the_decoded_actors_alone(prepared: Prepared) -> None:
     """Bystanders keep their planes; codes of actors that are not learned stay, whatever momentum they had."""
-    trainer = prepared.trainer(changed(SETTINGS, decoded_actors=1, patches=4))
+    trainer = prepared.trainer(changed(SETTINGS, decoded_actors=1, views=1, patches=4))
     model = trainer.model
     embeddings = (model.latent_mean, model.latent_log_variance)
     everyone = set(range(len(prepared.assets)))
@@ -292,3 +292,28 @@ def test_the_paper_profile_is_the_papers_model() -> None:
     assert (rendering.actor_step, rendering.background_step, rendering.sky_samples) == (0.05, 0.30, 8)
     assert rendering.occupancy_cell == 0.5
     assert settings.image_scale == 1.0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_gradients_of_a_step_are_the_sum_over_its_views_whatever_the_threads(
+    prepared: Prepared, threads: int
+) -> None:
+    """And laid out like parameters: fused Adam goes through memory, another layout would move the wrong weights."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    trainer = prepared.trainer()
+    assert torch.get_num_threads() == threads
+    torch.set_num_threads(before)
+    parameters = list(trainer.model.parameters())
+    reference = [torch.zeros_like(parameter) for parameter in parameters]
+    for view in range(SETTINGS.views):
+        for total, gradient in zip(reference, trainer._share(view).gradients, strict=True):
+            if gradient is not None:
+                total += gradient.to_dense()
+    trainer.advance()
+    for parameter, total in zip(parameters, reference, strict=True):
+        gradient = parameter.grad
+        assert gradient is not None
+        if not gradient.is_sparse:
+            assert gradient.stride() == parameter.stride()
+        torch.testing.assert_close(gradient.to_dense(), total)

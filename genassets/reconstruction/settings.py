@@ -105,11 +105,13 @@ class ReconstructionSettings(_Settings):
         default=0.25, description="size of rendered images as a share of the log's images"
     )
     steps: PositiveInt = 1500
-    patches: PositiveInt = 16
-    views_at_once: PositiveInt = Field(default=2, description="views that the patches of a step come from")
+    views: PositiveInt = Field(
+        default=2, description="views of a step; where there are cores, they are learned from side by side"
+    )
+    patches: PositiveInt = Field(default=8, description="patches of a view")
     decoded_actors: PositiveInt = Field(
-        default=12,
-        description="actors decoded and learned in a step; others that rays meet keep the planes they had",
+        default=8,
+        description="actors decoded and learned in a view; others that rays meet keep the planes they had",
     )
     patch_size: PositiveInt = Field(default=16, description="side of a training patch in feature pixels")
     patch_margin: Annotated[int, Field(ge=0)] = Field(
@@ -123,7 +125,7 @@ class ReconstructionSettings(_Settings):
     )
     object_patch_share: Annotated[float, Field(ge=0, le=1)] = Field(
         default=0.25,
-        description="share of steps that also render one actor's box, for the perceptual and the adversarial loss",
+        description="share of views that also render one actor's box, for the perceptual and the adversarial loss",
     )
     object_patch_limit: PositiveInt = Field(
         default=64,
@@ -136,15 +138,15 @@ class ReconstructionSettings(_Settings):
         default=0.5, description="share of the steps after which the adversarial loss sets in"
     )
     mirror_share: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.0, description="chance that a vehicle is learned left for right in a step"
+        default=0.0, description="chance that a vehicle is learned left for right in a view"
     )
-    lidar_rays: Annotated[int, Field(ge=0)] = 256
+    lidar_rays: Annotated[int, Field(ge=0)] = Field(default=128, description="LiDAR rays of a view")
     lidar_trim: Annotated[float, Field(ge=0, lt=1)] = Field(
         default=0.05, description="share of the largest LiDAR residuals left out of a batch"
     )
     surface_samples: Annotated[int, Field(ge=0)] = Field(
         default=64,
-        description="LiDAR returns, and points of free space before them, a learned actor and step",
+        description="LiDAR returns, and points of free space before them, a learned actor and view",
     )
     smallest_actor: PositiveInt = Field(
         default=8,

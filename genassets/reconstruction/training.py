@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -35,6 +35,7 @@ from genassets.reconstruction.losses import (
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
+from genassets.reconstruction.workers import Workers
 from genassets.rendering.rays import mirror_where, mirrored
 from genassets.rendering.renderer import (
     ActorFields,
@@ -63,6 +64,16 @@ class StepResult:
     actors: Tensor
     counts: SampleCounts
     compared: list[tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class _Share:
+    """One view's part of a step: its log, terms and fields, and the gradient of each parameter or None."""
+
+    log: int
+    result: StepResult
+    fields: ActorFields
+    gradients: Sequence[Tensor | None]
 
 
 def render_settings(settings: RenderingSettings) -> RenderSettings:
@@ -102,6 +113,8 @@ class Trainer:
         weights = settings.weights
         self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
         self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
+        self._parameters = list(model.parameters())
+        self._workers = Workers(settings.views)
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
         self.symmetric = torch.tensor([CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()])
         views = np.array([max(len(log.observations), 1) for log in data], dtype=np.float64)
@@ -114,27 +127,21 @@ class Trainer:
             StageError: a loss or a gradient is not finite; names term or parameters, step, log and actors.
                 The step has then changed nothing of `state`.
         """
-        rng = np.random.default_rng([self.seed, self.step])
-        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        number = int(rng.choice(len(self.data), p=self.log_chance))
-        batch = draw_batch(self.data[number], self.settings, self.model.stride, rng)
-        result, fields = self.losses(number, batch, generator)
-        weights = self.settings.weights.model_dump()
-        for term, value in result.losses.items():
-            if not torch.isfinite(value):
-                raise self._stopped(f"the loss term {term!r} is {value.item()}", number, result)
-        total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
-        self.dense.zero_grad(set_to_none=True)
-        self.sparse.zero_grad(set_to_none=True)
-        total.backward()
+        shares = self._workers.map(self._share, range(self.settings.views))
+        for parameter, gradients in zip(
+            self._parameters, zip(*(share.gradients for share in shares), strict=True), strict=True
+        ):
+            parameter.grad = _sum(gradients)
         gradients = _gradients(self.model)
+        result = _joined([share.result for share in shares])
         if not torch.isfinite(get_total_norm(value for values in gradients.values() for value in values)):
             norms = {part: get_total_norm(values).item() for part, values in gradients.items()}
             bad = ", ".join(f"{part} ({norm})" for part, norm in norms.items() if not math.isfinite(norm))
-            raise self._stopped(
-                f"the gradient's norm is not finite in {bad or 'all parts together'}", number, result
-            )
-        self._remember(result.actors, fields)
+            why = f"the gradient's norm is not finite in {bad or 'all parts together'}"
+            raise self._stopped(why, [share.log for share in shares], result)
+        for share in shares:
+            self._remember(share)
+        self._refresh_stalest(shares[0])
         self._set_rates()
         self.dense.step()
         self.sparse.step()
@@ -143,10 +150,26 @@ class Trainer:
         self.step += 1
         return result
 
-    def _stopped(self, why: str, number: int, result: StepResult) -> StageError:
+    def _share(self, view: int) -> _Share:
+        """What one view adds to a step; changes nothing, so that views can be rendered side by side."""
+        rng = np.random.default_rng([self.seed, self.step, view])
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        log = int(rng.choice(len(self.data), p=self.log_chance))
+        batch = draw_batch(self.data[log], self.settings, self.model.stride, rng)
+        result, fields = self.losses(log, batch, generator)
+        weights = self.settings.weights.model_dump()
+        for term, value in result.losses.items():
+            if not torch.isfinite(value):
+                raise self._stopped(f"the loss term {term!r} is {value.item()}", [log], result)
+        total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
+        gradients = torch.autograd.grad(total / self.settings.views, self._parameters, allow_unused=True)
+        return _Share(log, result, fields, gradients)
+
+    def _stopped(self, why: str, logs: list[int], result: StepResult) -> StageError:
+        names = ", ".join(dict.fromkeys(self.data[log].scene.log_name for log in logs))
         return StageError(
             f"reconstruct: {why} at step {self.step} "
-            f"(log {self.data[number].scene.log_name}, actors {result.actors.tolist()}); training stopped. "
+            f"(log {names}, actors {result.actors.tolist()}); training stopped. "
             "The last checkpoint is kept: lower the learning rates and run again."
         )
 
@@ -221,19 +244,24 @@ class Trainer:
         return pairs
 
     def _mirrored_actors(self, generator: torch.Generator | None) -> Tensor:
-        """Which actors of the library this step learns left for right."""
+        """Which actors of the library this view learns left for right."""
         if generator is None or not self.settings.mirror_share:
             return torch.zeros_like(self.symmetric)
         return self.symmetric & (
             torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
         )
 
-    def _remember(self, actors: Tensor, fields: ActorFields) -> None:
-        """Keep what a step decoded: planes for when its actors are bystanders, one actor's coarse distance."""
-        self.planes[actors] = half_planes(fields.planes[: len(actors)])
+    def _remember(self, share: _Share) -> None:
+        """Keep the planes that a view's actors were decoded to, for when they are bystanders."""
+        actors = share.result.actors
+        self.planes[actors] = half_planes(share.fields.planes[: len(actors)])
+
+    def _refresh_stalest(self, share: _Share) -> None:
+        """Now and then take one actor's coarse distance from what a view decoded."""
         if self.step % self.settings.rendering.coarse_refresh == 0:
+            actors = share.result.actors
             stalest = int(actors[self.refreshed[actors].argmin()])
-            self.model.refresh_coarse_distance(stalest, fields)
+            self.model.refresh_coarse_distance(stalest, share.fields)
             self.refreshed[stalest] = self.step + 1
 
     def _split_actors(self, samples: Tensor) -> tuple[Tensor, Tensor]:
@@ -304,6 +332,29 @@ def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, 
         {"params": list(model.backgrounds.parameters()), "lr": rates.background},
         {"params": list(model.rgb.parameters()), "lr": rates.rgb},
     ]
+
+
+def _joined(views: Sequence[StepResult]) -> StepResult:
+    """A step's result from those of its views: terms averaged over the views that have them."""
+    terms: dict[str, list[Tensor]] = {}
+    for view in views:
+        for term, value in view.losses.items():
+            terms.setdefault(term, []).append(value.detach())
+    return StepResult(
+        {term: torch.stack(values).mean() for term, values in terms.items()},
+        torch.cat([view.actors for view in views]).unique(),
+        SampleCounts(*(sum(counts) for counts in zip(*(astuple(v.counts) for v in views), strict=True))),
+        [pair for view in views for pair in view.compared],
+    )
+
+
+def _sum(gradients: Sequence[Tensor | None]) -> Tensor | None:
+    """The sum of the gradients that there are, laid out as parameters are: fused Adam goes through memory in order."""
+    there = [gradient for gradient in gradients if gradient is not None]
+    if not there:
+        return None
+    total = sum(there[1:], there[0])
+    return total if total.is_sparse else total.contiguous()
 
 
 def _gradients(model: AssetModel) -> dict[str, list[Tensor]]:

@@ -259,11 +259,10 @@ def _of_learnable(view: View, number_of: np.ndarray) -> View:
 def draw_batch(
     data: TrainingLog, settings: ReconstructionSettings, stride: int, rng: np.random.Generator
 ) -> Batch:
-    """Patches on and around actors, some anywhere, and LiDAR rays of one sweep.
+    """Patches of one view, on and around actors, some anywhere, and LiDAR rays of one sweep.
 
-    All patches come from `views_at_once` views, so that they share decoded actors. Views and observations are
-    drawn in proportion to the square root of the observations' areas: large ones hold more detail, small
-    ones are many.
+    The view and observations in it are drawn in proportion to the square root of the observations' areas: large
+    ones hold more detail, small ones are many.
     """
     side = settings.patch_size + 2 * settings.patch_margin
     parts, targets = [], []
@@ -271,21 +270,19 @@ def draw_batch(
     chance = np.sqrt(area)
     owner = np.array([o.view for o in data.observations], dtype=np.int64)
     of_view = np.bincount(owner, chance, minlength=len(data.views)) + 1e-9
-    count = min(settings.views_at_once, len(data.views))
-    chosen = rng.choice(len(data.views), count, replace=False, p=of_view / of_view.sum())
+    number = int(rng.choice(len(data.views), p=of_view / of_view.sum()))
+    view = data.views[number]
+    candidates = np.flatnonzero(owner == number)
 
-    def draw_observation(views: np.ndarray) -> Observation | None:
-        candidates = np.flatnonzero(np.isin(owner, views))
+    def draw_observation() -> Observation | None:
         if not len(candidates):
             return None
         share = chance[candidates] / chance[candidates].sum()
         return data.observations[int(rng.choice(candidates, p=share))]
 
-    for patch in range(settings.patches):
-        number = int(chosen[patch % count])
-        shown = draw_observation(chosen[patch % count]) if rng.random() >= settings.background_share else None
+    for _ in range(settings.patches):
+        shown = draw_observation() if rng.random() >= settings.background_share else None
         bounds = shown.bounds if shown else None
-        view = data.views[number]
         column, row = _place_patch(view, bounds, settings.patch_size, stride, rng)
         parts.append(patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride))
         x, y, extent = column * stride, row * stride, settings.patch_size * stride
@@ -293,7 +290,7 @@ def draw_batch(
     pixels = torch.stack(targets).permute(0, 3, 1, 2).float() / 255
     object_patch = None
     compared = settings.weights.perceptual or settings.weights.adversarial
-    shown = draw_observation(chosen) if compared and rng.random() < settings.object_patch_share else None
+    shown = draw_observation() if compared and rng.random() < settings.object_patch_share else None
     if shown:
         cast, object_patch = _object_patch(data, shown, settings, stride, rng)
         parts.append(cast)
