@@ -183,7 +183,7 @@ def test_background_inside_an_actors_box_belongs_to_the_actor() -> None:
     )
     origin, direction = np.array([[-5.0, 0, 0]]), np.array([[1.0, 0, 0]])
     rays = cast_rays(origin, direction, [0], np.eye(4)[None], CAR[None])
-    samples = sample_background(rays, step_edges(0.0, 10.0, 0.25, 0.0), everywhere, None)
+    samples, _ = sample_background(rays, step_edges(0.0, 10.0, 0.25, 0.0), everywhere, None)
     near, far = 5 - CAR[0] / 2 - BOX_PADDING[0], 5 + CAR[0] / 2 + BOX_PADDING[0]
     assert not ((samples.distance > near) & (samples.distance < far)).any()
     assert (samples.distance < near).any() and (samples.distance > far).any()

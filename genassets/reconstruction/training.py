@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -353,7 +353,7 @@ def train(
                 curve(f"loss/{term}", step, value.item())
             psnr = -10 * math.log10(max(result.losses["rgb"].item(), 1e-10))
             curve("training/patch_psnr", step, psnr)
-            for name, count in asdict(result.counts).items():
+            for name, count in result.counts.numbers().items():
                 curve(f"samples/{name}", step, count)
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
         if step % settings.checkpoint_every == 0 and step < settings.steps:
