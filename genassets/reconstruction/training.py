@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from pickle import UnpicklingError
@@ -20,7 +20,6 @@ from torch.nn.utils import get_total_norm
 from genassets.driving import CLASSES
 from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
-from genassets.fields.triplane import half_planes
 from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
 from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.lidar_surface import draw_surface_samples
@@ -33,6 +32,7 @@ from genassets.reconstruction.losses import (
     total_variation,
 )
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.remembered_planes import RememberedPlanes
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
 from genassets.rendering.rays import mirror_where, mirrored
@@ -55,12 +55,13 @@ Curve = Callable[[str, int, float], None]
 
 @dataclass(frozen=True)
 class StepResult:
-    """The terms of one step, unweighted, the actors that it learned, and pairs of rendered and observed images
-    (n, 3, h, w) that the discriminator compares.
+    """The terms of one step, unweighted, the actors that it learned, those that it only looked past, and pairs of
+    rendered and observed images (n, 3, h, w) that the discriminator compares.
     """
 
     losses: dict[str, Tensor]
     actors: Tensor
+    bystanders: Tensor
     counts: SampleCounts
     compared: list[tuple[Tensor, Tensor]]
 
@@ -91,9 +92,7 @@ class Trainer:
         self.model, self.data, self.settings, self.seed = model, data, settings, seed
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
-        self.planes = torch.cat(
-            [half_planes(planes) for _, planes in decode_all(model)]
-        )  # of every actor, as last decoded: what a step that only looks past an actor uses
+        self.planes = RememberedPlanes()  # what a step that only looks past an actor uses
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
@@ -134,7 +133,7 @@ class Trainer:
             raise self._stopped(
                 f"the gradient's norm is not finite in {bad or 'all parts together'}", number, result
             )
-        self._remember(result.actors, fields)
+        self._remember(result, fields)
         self._set_rates()
         self.dense.step()
         self.sparse.step()
@@ -165,7 +164,7 @@ class Trainer:
         actors, bystanders = self._split_actors(culled.samples_of_actors(rays))
         latents = model.latents(actors, generator)
         decoded = model.decode(actors, latents.code)
-        planes = torch.cat((decoded, self.planes[bystanders].float()))
+        planes = torch.cat((decoded, self.planes.of(model, bystanders))) if len(bystanders) else decoded
         fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
         background = model.background_fields(number, self.data[number].occupancy)
         lidar = slice(batch.camera_rays, None)
@@ -199,7 +198,7 @@ class Trainer:
             and self.step >= settings.adversarial_start * settings.steps
         ):
             losses["adversarial"] = generator_loss(self.adversary.scores(shown for shown, _ in compared))
-        return StepResult(losses, actors, rendered.counts, compared), fields
+        return StepResult(losses, actors, bystanders, rendered.counts, compared), fields
 
     def _image(self, feature: Tensor, rows: int, columns: int) -> Tensor:
         """Images (n, 3, h, w) of feature maps rows x columns, their margin cut off."""
@@ -228,9 +227,12 @@ class Trainer:
             torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
         )
 
-    def _remember(self, actors: Tensor, fields: ActorFields) -> None:
+    def _remember(self, result: StepResult, fields: ActorFields) -> None:
         """Keep what a step decoded: planes for when its actors are bystanders, one actor's coarse distance."""
-        self.planes[actors] = half_planes(fields.planes[: len(actors)])
+        actors = result.actors
+        learned, passed = fields.planes.tensor_split([len(actors)])
+        self.planes.keep(result.bystanders, passed)
+        self.planes.keep(actors, learned)
         if self.step % self.settings.rendering.coarse_refresh == 0:
             stalest = int(actors[self.refreshed[actors].argmin()])
             self.model.refresh_coarse_distance(stalest, fields)
@@ -266,7 +268,7 @@ class Trainer:
         return {
             "step": self.step,
             "refreshed": self.refreshed,
-            "planes": self.planes,
+            "planes": self.planes.state(),
             "model": self.model.state_dict(),
             "dense": self.dense.state_dict(),
             "sparse": self.sparse.state_dict(),
@@ -277,19 +279,12 @@ class Trainer:
         """Continue from a state."""
         self.step = int(state["step"])
         self.refreshed = state["refreshed"]
-        self.planes = state["planes"]
+        self.planes.restore(state["planes"])
         self.model.load_state_dict(state["model"])
         self.dense.load_state_dict(state["dense"])
         self.sparse.load_state_dict(state["sparse"])
         if self.adversary is not None:
             self.adversary.restore(state["adversary"])
-
-
-@torch.no_grad()
-def decode_all(model: AssetModel, at_once: int = 16) -> Iterator[tuple[Tensor, Tensor]]:
-    """Every actor's index and planes from its mean code, some at a time."""
-    for actors in torch.arange(len(model.sizes)).split(at_once):
-        yield actors, model.decode(actors, model.latents(actors).code)
 
 
 def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
