@@ -15,8 +15,9 @@ from genassets.geometry.cameras import (
     pixel_directions,
     project,
     project_box,
+    spheres_in_image,
 )
-from genassets.geometry.transforms import make_pose
+from genassets.geometry.transforms import make_pose, yaw_pose
 
 CAMERA = Intrinsics(100.0, 100.0, 50.0, 40.0, 100, 80)
 
@@ -110,3 +111,14 @@ def test_a_box_in_front_gives_the_same_bounds_as_its_corners() -> None:
         assert box is not None
         np.testing.assert_allclose(box.hull.min(axis=0), corners.min(axis=0))
         np.testing.assert_allclose(box.hull.max(axis=0), corners.max(axis=0))
+
+
+def test_no_box_that_is_in_the_image_is_left_out_by_its_sphere() -> None:
+    camera = Intrinsics(400.0, 380.0, 230.0, 140.0, 480, 270)
+    rng = np.random.default_rng(3)
+    centres, sizes = rng.uniform(-30, 30, (3000, 3)), rng.uniform(0.3, 8, (3000, 3))
+    poses = yaw_pose(rng.uniform(-3, 3, 3000), centres)
+    shown = np.array([project_box(camera, p, s) is not None for p, s in zip(poses, sizes, strict=True)])
+    kept = spheres_in_image(camera, centres, np.linalg.norm(sizes, axis=1) / 2)
+    assert not (shown & ~kept).any()
+    assert shown.sum() > 100 and kept.sum() < 0.5 * len(kept)  # it drops most of the rest

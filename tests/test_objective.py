@@ -134,7 +134,10 @@ def test_an_object_patch_is_the_actors_box_resized(prepared: Prepared) -> None:
     boxes = [o.bounds for o in prepared.data[0].observations]
     shape = [(abs(b[2] - b[0] - width), abs(b[3] - b[1] - height)) for b in boxes]
     assert min(max(difference) for difference in shape) <= 2 * STRIDE
-    assert batch.camera_rays == SETTINGS.patches * batch.side**2 + batch.object_patch.rows * batch.object_patch.columns
+    assert (
+        batch.camera_rays
+        == SETTINGS.patches * batch.side**2 + batch.object_patch.rows * batch.object_patch.columns
+    )
     ((rendered, observed),) = compared(prepared.trainer(wide), wide)
     assert rendered.shape == observed.shape == (1, 3, 64, 64)
     narrow = changed(FULL, object_patch_limit=3)

@@ -19,6 +19,7 @@ from genassets.rendering.renderer import (
     BackgroundFields,
     CoarseActors,
     RenderSettings,
+    SampleCounts,
     cull,
     render_rays,
 )
@@ -148,6 +149,60 @@ def test_culling_saves_samples_and_hardly_changes_the_result() -> None:
     assert ((fast.feature - exact.feature).abs().mean() / scale).item() < 0.005
 
 
+def test_counts_are_those_of_a_plain_count() -> None:
+    """One ray and one interval at a time, with numpy; a third actor that no ray meets counts nowhere."""
+    actors, background, coarse = scene()
+    rays = some_rays(30)
+    with torch.no_grad():
+        exact = render_rays(rays, cull(rays, coarse, SETTINGS), actors, background, SETTINGS).counts
+    hits, edges = rays.hits, step_edges(1.0, 30.0, 0.5, 0.0).numpy()
+    places = (edges[:-1] + edges[1:]) / 2
+    grid = background.occupancy
+    in_boxes = outside = occupied = 0
+    for ray in range(len(rays)):
+        spans = [
+            (float(hits.near[h]), float(hits.far[h])) for h in range(len(hits)) if int(hits.ray[h]) == ray
+        ]
+        in_boxes += sum(int(np.ceil((far - near) / SETTINGS.actor_step)) for near, far in spans)
+        for place in places:
+            if any(near <= place <= far for near, far in spans):
+                continue
+            outside += 1
+            point = rays.origin[ray].numpy() + place * rays.direction[ray].numpy()
+            cell = np.floor((point - grid.lower.numpy()) / grid.cell).astype(int)
+            if np.all(cell >= 0) and np.all(cell < grid.cells.shape):
+                occupied += bool(grid.cells[tuple(cell)])
+    assert exact.numbers() == {
+        "actors_met": 2,
+        "actors_left": 2,
+        "actor_in_boxes": in_boxes,
+        "actor_near_surface": in_boxes,  # the exact mode culls nothing
+        "background_outside_boxes": outside,
+        "background_occupied": occupied,
+        "evaluated": in_boxes + occupied + 4 * len(rays),  # and the sky
+        "shaded": in_boxes + occupied + 4 * len(rays),
+    }
+    assert 0 < occupied < outside
+
+
+def test_counts_of_two_renderings_add_up_and_actors_count_once() -> None:
+    one = SampleCounts(frozenset({1, 2}), frozenset({2}), 10, 5, 20, 8, 17, 6)
+    two = SampleCounts(frozenset({2, 7}), frozenset({7}), 1, 1, 2, 2, 3, 3)
+    assert one + two == SampleCounts(frozenset({1, 2, 7}), frozenset({2, 7}), 11, 6, 22, 10, 20, 9)
+    assert (one + two).numbers()["actors_met"] == 3
+
+
+def test_an_actor_in_clear_space_alone_is_met_and_not_left() -> None:
+    actors, background, coarse = scene()
+    clear = dataclasses.replace(coarse, distance=torch.full_like(coarse.distance, 9.0))
+    settings = dataclasses.replace(SETTINGS, exact=False)
+    rays = some_rays(10)
+    with torch.no_grad():
+        counts = render_rays(rays, cull(rays, clear, settings), actors, background, settings).counts
+    assert (counts.actors_met, counts.actors_left) == ({0, 1}, frozenset())
+    assert counts.actor_in_boxes > 0 == counts.actor_near_surface
+
+
 def test_training_and_inference_render_the_same() -> None:
     actors, background, coarse = scene()
     rays = some_rays(50)
@@ -183,7 +238,7 @@ def test_background_inside_an_actors_box_belongs_to_the_actor() -> None:
     )
     origin, direction = np.array([[-5.0, 0, 0]]), np.array([[1.0, 0, 0]])
     rays = cast_rays(origin, direction, [0], np.eye(4)[None], CAR[None])
-    samples = sample_background(rays, step_edges(0.0, 10.0, 0.25, 0.0), everywhere, None)
+    samples, _ = sample_background(rays, step_edges(0.0, 10.0, 0.25, 0.0), everywhere, None)
     near, far = 5 - CAR[0] / 2 - BOX_PADDING[0], 5 + CAR[0] / 2 + BOX_PADDING[0]
     assert not ((samples.distance > near) & (samples.distance < far)).any()
     assert (samples.distance < near).any() and (samples.distance > far).any()

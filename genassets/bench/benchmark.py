@@ -22,6 +22,6 @@ class Benchmark:
 
 def benchmarks() -> tuple[Benchmark, ...]:
     """Every benchmark, in the order of the table. Modules import heavy libraries inside ``run``."""
-    from genassets.bench import masks, pipeline_overhead
+    from genassets.bench import masks, pipeline_overhead, visible_cost
 
-    return (pipeline_overhead.BENCHMARK, masks.BENCHMARK)
+    return (pipeline_overhead.BENCHMARK, masks.BENCHMARK, visible_cost.BENCHMARK)

@@ -84,6 +84,27 @@ def pixel_centres(x0: int, y0: int, x1: int, y1: int) -> Array:
     return np.stack([columns.ravel(), rows.ravel()], axis=-1)
 
 
+def spheres_in_image(intrinsics: Intrinsics, centres: ArrayLike, radii: ArrayLike) -> NDArray[np.bool_]:
+    """Which spheres, with camera-frame centres (N, 3) and radii (N,) in metres, may reach into the image.
+
+    Quick and safe: one that does not lies behind the camera, or beyond the plane through the camera and one edge
+    of the image; a sphere outside a corner may be let through.
+    """
+    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    inward = np.array(
+        [
+            [0.0, 0.0, 1.0],
+            [fx, 0.0, cx],
+            [-fx, 0.0, intrinsics.width - cx],
+            [0.0, fy, cy],
+            [0.0, -fy, intrinsics.height - cy],
+        ]
+    )
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    beyond = np.asarray(centres, np.float64) @ inward.T + np.asarray(radii, np.float64)[:, None]
+    return np.all(beyond >= -1e-6, axis=1)  # a micrometre for rounding: in doubt it may be seen
+
+
 def project_box(
     intrinsics: Intrinsics, camera_from_box: ArrayLike, size: ArrayLike, near: float = 0.1
 ) -> BoxProjection | None:

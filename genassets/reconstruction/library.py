@@ -80,7 +80,8 @@ class AssetLibrary:
     def indices_of_log(self, log_name: str) -> dict[str, int]:
         """Row of every actor of a log, by actor id."""
         rows = np.flatnonzero(self.assets["log"] == log_name)
-        return {str(self.assets["actor_id"].iloc[row]): int(row) for row in rows}
+        actor_ids = self.assets["actor_id"].to_numpy()[rows]
+        return dict(zip(map(str, actor_ids), rows.tolist(), strict=True))
 
 
 def save_library(library: AssetLibrary, directory: Path) -> None:

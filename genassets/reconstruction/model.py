@@ -92,7 +92,9 @@ class AssetModel(nn.Module):
             self.latent_log_variance.weight.fill_(LOG_VARIANCE_START)
         self.register_buffer("sizes", sizes.float())
         self.register_buffer("class_index", class_index.long())
-        self.register_buffer("coarse_distance", prior_distance(sizes.float(), settings.coarse_resolution))
+        # Half precision is off by 0.05 % at most, little beside the radius of a cell, and every actor has a grid.
+        coarse = prior_distance(sizes.float(), settings.coarse_resolution, torch.float16)
+        self.register_buffer("coarse_distance", coarse)
 
     @property
     def stride(self) -> int:

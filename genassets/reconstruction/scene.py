@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from genassets.driving import Log, Track, actor_mask
 from genassets.driving.sweep import SPINNING, SPINNING_POSITION
 from genassets.geometry.boxes import intersect_box
-from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box
+from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box, spheres_in_image
 from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 from genassets.rendering.rays import BOX_PADDING
 
@@ -55,6 +55,10 @@ class PlacedActors:
 
     def select(self, keep: NDArray) -> PlacedActors:
         return PlacedActors(self.index[keep], self.scene_from_box[keep], self.sizes[keep])
+
+    def radii(self, padding: Sequence[float]) -> Array:
+        """Radii (A,) in metres of the spheres around the boxes with `padding` metres on every side."""
+        return np.linalg.norm(self.sizes / 2 + np.asarray(padding), axis=1)
 
     def crossing(
         self, row: int, origins: Array, directions: Array, padding: Sequence[float] = (0.0, 0.0, 0.0)
@@ -144,6 +148,9 @@ def make_view(
     actors = placed_actors(log, frame, float(stream.times[frame]), index, scene)
     scene_from_camera = scene.pose(stream.world_from_camera[frame])
     camera_from_scene = invert_pose(scene_from_camera)
+    centres = transform_points(camera_from_scene, actors.scene_from_box[:, :3, 3])
+    # Most of a log's actors are elsewhere: their boxes are not even projected.
+    actors = actors.select(spheres_in_image(intrinsics, centres, actors.radii(BOX_PADDING)))
     visible = np.zeros(len(actors.index), dtype=bool)
     bounds, padded_bounds = [], []
     for row, (pose, size) in enumerate(zip(actors.scene_from_box, actors.sizes, strict=True)):
@@ -199,11 +206,17 @@ def lidar_rays(
     direction = (points[keep] - origin) / distance[keep, None]
     distance, owner = distance[keep], owner[keep]
     crossed = np.full(len(distance), -1, dtype=np.int64)
-    for row, number in enumerate(actors.index):
-        ahead = np.flatnonzero(direction @ (actors.scene_from_box[row, :3, 3] - origin) > 0)
-        start = np.broadcast_to(origin, (len(ahead), 3))
-        left = actors.crossing(row, start, direction[ahead], padding)[1]
-        crossed[ahead[left < distance[ahead]]] = number
+    to_centre = actors.scene_from_box[:, :3, 3] - origin
+    from_centre = np.linalg.norm(to_centre, axis=1)
+    radii = actors.radii(padding)
+    longest = distance.max(initial=0.0)
+    for row in np.flatnonzero(from_centre - radii < longest):
+        along = direction @ to_centre[row]
+        # Rays that meet the sphere around the box: few, and only they can go through the box.
+        near = np.flatnonzero((along > 0) & (along**2 >= from_centre[row] ** 2 - radii[row] ** 2))
+        start = np.broadcast_to(origin, (len(near), 3))
+        left = actors.crossing(row, start, direction[near], padding)[1]
+        crossed[near[left < distance[near]]] = actors.index[row]
     crossed[owner >= 0] = -1
     return LidarSweepRays(frame, origin, direction, distance, owner, crossed, actors)
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +27,7 @@ from genassets.rendering.rays import cast_rays
 from genassets.rendering.renderer import (
     ActorFields,
     RenderSettings,
+    SampleCounts,
     actor_distance,
     cull,
     padded_half_size,
@@ -48,11 +50,15 @@ class ActorView:
 class RegionView:
     """A region of a scene: rgb (h, w, 3) in [0, 1], and in feature pixels opacity and depth (rows, columns) in
     metres along the ray, not divided by opacity; neither counts the sky.
+
+    actors_in_view: how many of the library's actors the whole image shows, by their boxes. counts: what was culled.
     """
 
     rgb: NDArray[np.float32]
     opacity: NDArray[np.float64]
     depth: NDArray[np.float64]
+    actors_in_view: int
+    counts: SampleCounts
 
 
 class SceneRenderer:
@@ -74,7 +80,7 @@ class SceneRenderer:
         self._dtype = next(library.model.parameters()).dtype
         # Feature pixels rendered around a region, so that the image network sees no border inside it.
         self._context = library.model.rgb.reach
-        self._planes = lru_cache(maxsize=256)(self._decode)
+        self._planes = functools.lru_cache(maxsize=256)(self._decode)
 
     @classmethod
     def load(cls, path: Path) -> SceneRenderer:
@@ -119,7 +125,7 @@ class SceneRenderer:
             self.library.model.logs.index(log.name), self.library.occupancy[log.name]
         )
         coarse = self.library.model.coarse_actors()
-        strips = []
+        strips, counts = [], []
         for top in range(fy0, fy1, rows_at_once):
             rows = (fx0, top, fx1, min(top + rows_at_once, fy1))
             rays = region_rays(view, rows, stride, self._dtype)
@@ -128,11 +134,18 @@ class SceneRenderer:
             fields = self._fields(met or [0])  # one stands in where none is met
             out = render_rays(rays, culled, fields, background, self._settings)
             strips.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
+            counts.append(out.counts)
         maps = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
         image = self.library.model.rgb(maps[:, :-2]).clamp(0, 1)[0].permute(1, 2, 0).float().numpy()
         left, top = x0 - fx0 * stride, y0 - fy0 * stride
         inner = maps[0, -2:, context : fy1 - fy0 - context, context : fx1 - fx0 - context].double().numpy()
-        return RegionView(image[top : top + y1 - y0, left : left + x1 - x0], inner[0], inner[1])
+        return RegionView(
+            image[top : top + y1 - y0, left : left + x1 - x0],
+            inner[0],
+            inner[1],
+            len(view.actors.index),
+            functools.reduce(operator.add, counts),
+        )
 
     @torch.no_grad()
     def render_actor(

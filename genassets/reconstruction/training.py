@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -20,7 +22,6 @@ from torch.nn.utils import get_total_norm
 from genassets.driving import CLASSES
 from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
-from genassets.fields.triplane import half_planes
 from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
 from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.lidar_surface import draw_surface_samples
@@ -33,6 +34,7 @@ from genassets.reconstruction.losses import (
     total_variation,
 )
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.remembered_planes import RememberedPlanes
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
 from genassets.reconstruction.workers import Workers
@@ -56,12 +58,13 @@ Curve = Callable[[str, int, float], None]
 
 @dataclass(frozen=True)
 class StepResult:
-    """The terms of one step, unweighted, the actors that it learned, and pairs of rendered and observed images
-    (n, 3, h, w) that the discriminator compares.
+    """The terms of one step, unweighted, the actors that it learned, those that it only looked past, and pairs of
+    rendered and observed images (n, 3, h, w) that the discriminator compares.
     """
 
     losses: dict[str, Tensor]
     actors: Tensor
+    bystanders: Tensor
     counts: SampleCounts
     compared: list[tuple[Tensor, Tensor]]
 
@@ -102,9 +105,7 @@ class Trainer:
         self.model, self.data, self.settings, self.seed = model, data, settings, seed
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
-        self.planes = torch.cat(
-            [half_planes(planes) for _, planes in decode_all(model)]
-        )  # of every actor, as last decoded: what a step that only looks past an actor uses
+        self.planes = RememberedPlanes()  # what a step that only looks past an actor uses
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
@@ -139,9 +140,7 @@ class Trainer:
             bad = ", ".join(f"{part} ({norm})" for part, norm in norms.items() if not math.isfinite(norm))
             why = f"the gradient's norm is not finite in {bad or 'all parts together'}"
             raise self._stopped(why, [share.log for share in shares], result)
-        for share in shares:
-            self._remember(share)
-        self._refresh_stalest(shares[0])
+        self._remember(shares)
         self._set_rates()
         self.dense.step()
         self.sparse.step()
@@ -188,7 +187,7 @@ class Trainer:
         actors, bystanders = self._split_actors(culled.samples_of_actors(rays))
         latents = model.latents(actors, generator)
         decoded = model.decode(actors, latents.code)
-        planes = torch.cat((decoded, self.planes[bystanders].float()))
+        planes = torch.cat((decoded, self.planes.of(model, bystanders))) if len(bystanders) else decoded
         fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
         background = model.background_fields(number, self.data[number].occupancy)
         lidar = slice(batch.camera_rays, None)
@@ -222,7 +221,7 @@ class Trainer:
             and self.step >= settings.adversarial_start * settings.steps
         ):
             losses["adversarial"] = generator_loss(self.adversary.scores(shown for shown, _ in compared))
-        return StepResult(losses, actors, rendered.counts, compared), fields
+        return StepResult(losses, actors, bystanders, rendered.counts, compared), fields
 
     def _image(self, feature: Tensor, rows: int, columns: int) -> Tensor:
         """Images (n, 3, h, w) of feature maps rows x columns, their margin cut off."""
@@ -251,17 +250,18 @@ class Trainer:
             torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
         )
 
-    def _remember(self, share: _Share) -> None:
-        """Keep the planes that a view's actors were decoded to, for when they are bystanders."""
-        actors = share.result.actors
-        self.planes[actors] = half_planes(share.fields.planes[: len(actors)])
-
-    def _refresh_stalest(self, share: _Share) -> None:
-        """Now and then take one actor's coarse distance from what a view decoded."""
+    def _remember(self, shares: Sequence[_Share]) -> None:
+        """Keep what a step decoded: planes for when its actors are bystanders; of the first view one actor's
+        coarse distance.
+        """
+        passed = [(s.result.bystanders, s.fields.planes[len(s.result.actors) :]) for s in shares]
+        learned = [(s.result.actors, s.fields.planes[: len(s.result.actors)]) for s in shares]
+        for actors, planes in (*passed, *learned):  # what was learned is newer than what others looked past
+            self.planes.keep(actors, planes)
         if self.step % self.settings.rendering.coarse_refresh == 0:
-            actors = share.result.actors
+            actors = shares[0].result.actors
             stalest = int(actors[self.refreshed[actors].argmin()])
-            self.model.refresh_coarse_distance(stalest, share.fields)
+            self.model.refresh_coarse_distance(stalest, shares[0].fields)
             self.refreshed[stalest] = self.step + 1
 
     def _split_actors(self, samples: Tensor) -> tuple[Tensor, Tensor]:
@@ -294,7 +294,7 @@ class Trainer:
         return {
             "step": self.step,
             "refreshed": self.refreshed,
-            "planes": self.planes,
+            "planes": self.planes.state(),
             "model": self.model.state_dict(),
             "dense": self.dense.state_dict(),
             "sparse": self.sparse.state_dict(),
@@ -305,19 +305,12 @@ class Trainer:
         """Continue from a state."""
         self.step = int(state["step"])
         self.refreshed = state["refreshed"]
-        self.planes = state["planes"]
+        self.planes.restore(state["planes"])
         self.model.load_state_dict(state["model"])
         self.dense.load_state_dict(state["dense"])
         self.sparse.load_state_dict(state["sparse"])
         if self.adversary is not None:
             self.adversary.restore(state["adversary"])
-
-
-@torch.no_grad()
-def decode_all(model: AssetModel, at_once: int = 16) -> Iterator[tuple[Tensor, Tensor]]:
-    """Every actor's index and planes from its mean code, some at a time."""
-    for actors in torch.arange(len(model.sizes)).split(at_once):
-        yield actors, model.decode(actors, model.latents(actors).code)
 
 
 def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
@@ -343,7 +336,8 @@ def _joined(views: Sequence[StepResult]) -> StepResult:
     return StepResult(
         {term: torch.stack(values).mean() for term, values in terms.items()},
         torch.cat([view.actors for view in views]).unique(),
-        SampleCounts(*(sum(counts) for counts in zip(*(astuple(v.counts) for v in views), strict=True))),
+        torch.cat([view.bystanders for view in views]).unique(),
+        reduce(add, (view.counts for view in views)),
         [pair for view in views for pair in view.compared],
     )
 
@@ -404,7 +398,7 @@ def train(
                 curve(f"loss/{term}", step, value.item())
             psnr = -10 * math.log10(max(result.losses["rgb"].item(), 1e-10))
             curve("training/patch_psnr", step, psnr)
-            for name, count in asdict(result.counts).items():
+            for name, count in result.counts.numbers().items():
                 curve(f"samples/{name}", step, count)
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
         if step % settings.checkpoint_every == 0 and step < settings.steps:

@@ -20,14 +20,15 @@ def cell_centres(resolution: int) -> Float[Tensor, "cells 3"]:
     return torch.cartesian_prod(axis, axis, axis)
 
 
-def prior_distance(size: Float[Tensor, "actors 3"], resolution: int) -> Float[Tensor, "actors x y z"]:
+def prior_distance(
+    size: Float[Tensor, "actors 3"], resolution: int, dtype: torch.dtype = torch.float32
+) -> Float[Tensor, "actors x y z"]:
     """Coarse distance in metres of untrained actors: the rounded box that they start at."""
     centres = cell_centres(resolution)
-    grids = [
-        bounded_distance(centres * half, one.expand(len(centres), 3), torch.zeros(len(centres)))
-        for half, one in zip(padded_half_size(size), size, strict=True)
-    ]
-    return torch.stack(grids).reshape(len(size), resolution, resolution, resolution)
+    grids = torch.empty(len(size), *(resolution,) * 3, dtype=dtype)
+    for grid, half, one in zip(grids.flatten(1), padded_half_size(size), size, strict=True):
+        grid.copy_(bounded_distance(centres * half, one.expand(len(centres), 3), torch.zeros(len(centres))))
+    return grids
 
 
 @torch.no_grad()

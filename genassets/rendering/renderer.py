@@ -65,7 +65,7 @@ class CoarseActors:
     """What is known of every actor without decoding it; sizes are l, w, h in metres.
 
     distance holds the signed distance in metres at the cell centres of each actor's padded box, as it last
-    was: what culls samples, and whole actors, before any look-up.
+    was: what culls samples, and whole actors, before any look-up. It may be kept in half precision.
     """
 
     size: Float[Tensor, "actors 3"]
@@ -109,12 +109,41 @@ class Culled:
 
 @dataclass(frozen=True)
 class SampleCounts:
-    """How many samples were left after each cull."""
+    """What there was before and after each cull; counts of several renderings can be added.
 
-    in_boxes: int
-    in_occupied_boxes: int
-    background: int
+    actors_met are the actors whose padded boxes rays cross, actors_left those that the coarse distance leaves
+    any sample; only these are looked up. actor_in_boxes and actor_near_surface are samples before and after the
+    coarse distance, background_outside_boxes and background_occupied before and after the LiDAR occupancy. The
+    weight of every `evaluated` sample was worked out: what those culls left, and the sky. `shaded` samples
+    weigh enough to get features (and gradients).
+    """
+
+    actors_met: frozenset[int]
+    actors_left: frozenset[int]
+    actor_in_boxes: int
+    actor_near_surface: int
+    background_outside_boxes: int
+    background_occupied: int
+    evaluated: int
     shaded: int
+
+    def __add__(self, other: SampleCounts) -> SampleCounts:
+        return SampleCounts(
+            self.actors_met | other.actors_met,
+            self.actors_left | other.actors_left,
+            self.actor_in_boxes + other.actor_in_boxes,
+            self.actor_near_surface + other.actor_near_surface,
+            self.background_outside_boxes + other.background_outside_boxes,
+            self.background_occupied + other.background_occupied,
+            self.evaluated + other.evaluated,
+            self.shaded + other.shaded,
+        )
+
+    def numbers(self) -> dict[str, int]:
+        """Every count by its name, of actors how many."""
+        return {
+            name: len(value) if isinstance(value, frozenset) else value for name, value in vars(self).items()
+        }
 
 
 @dataclass(frozen=True)
@@ -170,8 +199,8 @@ def render_rays(
     to meet nothing.
     """
     occupied = culled.samples
-    static = _background_samples(rays, background, settings, generator)
-    background_count = len(static.ray)
+    near, outside_boxes = _background_samples(rays, background, settings, generator)
+    static = near if background is None else _with_sky(near, rays, settings)
 
     with torch.no_grad():
         evaluated = _evaluate(occupied, static, rays, actors, background)
@@ -216,8 +245,22 @@ def render_rays(
         sums[:, 0],
         sums[:, 1],
         in_free_space,
-        SampleCounts(culled.in_boxes, len(occupied.hit), background_count, len(ray)),
+        SampleCounts(
+            _numbers_of(torch.bincount(rays.hits.actor)),
+            _numbers_of(culled.samples_of_actors(rays)),
+            culled.in_boxes,
+            len(occupied.hit),
+            outside_boxes,
+            len(near.ray),
+            len(keep),
+            len(ray),
+        ),
     )
+
+
+def _numbers_of(count: Int[Tensor, " actors"]) -> frozenset[int]:
+    """The actors that have any."""
+    return frozenset(torch.nonzero(count)[:, 0].tolist())
 
 
 def actor_distance(
@@ -271,17 +314,22 @@ def _background_samples(
     background: BackgroundFields | None,
     settings: RenderSettings,
     generator: torch.Generator | None,
-) -> BackgroundSamples:
+) -> tuple[BackgroundSamples, int]:
+    """Samples up to background_far, and how many there were before occupancy was asked."""
     if background is None:
         none = torch.zeros(0, device=rays.origin.device)
-        return BackgroundSamples(none.long(), none.reshape(0, 3), none, none)
+        return BackgroundSamples(none.long(), none.reshape(0, 3), none, none), 0
     edges = step_edges(
         settings.background_near,
         settings.background_far,
         settings.background_step,
         settings.background_growth,
     )
-    near = sample_background(rays, edges, background.occupancy, generator)
+    return sample_background(rays, edges, background.occupancy, generator)
+
+
+def _with_sky(near: BackgroundSamples, rays: Rays, settings: RenderSettings) -> BackgroundSamples:
+    """The samples with those beyond background_far after them."""
     sky = sample_sky(rays, settings.sky_samples, settings.background_far)
     return BackgroundSamples(
         torch.cat((near.ray, sky.ray)),
@@ -302,7 +350,7 @@ def _may_be_seen(samples: ActorSamples, rays: Rays, coarse: CoarseActors) -> Boo
     resolution = coarse.distance.shape[-1]
     cell = ((samples.position / half[actor] * 0.5 + 0.5) * resolution).long().clamp(0, resolution - 1)
     flat = ((actor * resolution + cell[:, 0]) * resolution + cell[:, 1]) * resolution + cell[:, 2]
-    distance = coarse.distance.reshape(-1)[flat]
+    distance = coarse.distance.reshape(-1)[flat].to(samples.distance.dtype)
     radius = torch.linalg.vector_norm(half / resolution, dim=-1)[actor]
     near_surface = torch.nonzero(coarse.beta * (distance - radius) <= CLEAR_BEYOND)[:, 0]
     absorbed = log_transmittance(

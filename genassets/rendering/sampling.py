@@ -74,18 +74,22 @@ def step_edges(near: float, far: float, step: float, growth: float) -> Float[Ten
 
 def sample_background(
     rays: Rays, edges: Float[Tensor, " edges"], occupancy: OccupancyGrid, generator: torch.Generator | None
-) -> BackgroundSamples:
-    """Samples in occupied cells of the static scene that no actor's box owns, nearer than the ray's limit."""
+) -> tuple[BackgroundSamples, int]:
+    """Samples in occupied cells of the static scene that no actor's box owns, nearer than the ray's limit.
+
+    Also returns how many there were before occupancy was asked.
+    """
     device = rays.origin.device
     lower, width = edges[:-1].to(device), edges.diff().to(device)
     shift = 0.5 if generator is None else _uniform(len(rays), generator, device)[:, None]
     distance = lower + shift * width
     distance = distance.expand(len(rays), -1)
     position = rays.origin[:, None] + distance[..., None] * rays.direction[:, None]
-    keep = occupancy.occupied(position) & (distance < rays.limit[:, None])
-    keep &= ~_owned_by_actors(rays, distance)
+    keep = (distance < rays.limit[:, None]) & ~_owned_by_actors(rays, distance)
+    before = int(keep.sum())
+    keep &= occupancy.occupied(position)
     ray, column = torch.nonzero(keep, as_tuple=True)
-    return BackgroundSamples(ray, position[ray, column], distance[ray, column], width[column])
+    return BackgroundSamples(ray, position[ray, column], distance[ray, column], width[column]), before
 
 
 def sample_sky(rays: Rays, count: int, start: float) -> BackgroundSamples:

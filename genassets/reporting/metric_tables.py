@@ -83,6 +83,12 @@ def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
     counts.
     """
     gains = [row for row in rows if row["metric"].endswith("_gain")]
+    culls = [
+        {**row, "cull": row["setting"].removeprefix("culls/")}
+        for row in rows
+        if row["setting"].startswith("culls/")
+    ]
+    rows = [row for row in rows if not row["setting"].startswith("culls/")]
     counts = [row for row in rows if row["method"].startswith("count")]
     means = [row for row in rows if row not in gains and row not in counts]
     overall = [row for row in means if row["class"] == "all" and row["split"] == "test"]
@@ -102,6 +108,7 @@ def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
         metric_table("By class, moved and same together", by_class, ("class", "method")),
         metric_table("By log, moved and same together", by_log, ("split", "method")),
         metric_table("Observations and actors", counts, ("setting",), compete=False),
+        metric_table("What rendering whole frames culled", culls, ("split", "cull"), compete=False),
         metric_table(
             "By group, class and log", details, ("setting", "split", "class", "method"), folded=True
         ),

@@ -21,9 +21,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from genassets.driving.log import Log
-    from genassets.evaluation.sparse_view import ImageRenderer, Observation, Scored, Skipped, View
+    from genassets.evaluation.sparse_view import Observation, Scored, Skipped, View
     from genassets.export.picture_list import PictureList
+    from genassets.reconstruction.scene_renderer import RegionView, SceneRenderer
 
+
+CULL_METHOD = "count; mean over whole frames, those in the pictures"
 
 WHOLE_FRAME_WIDTH = 480
 """Pixels that a whole frame has at least in its picture."""
@@ -98,6 +101,7 @@ def run(
     pictures = PictureList(out)
     scored: list[Scored] = []
     skipped: list[Skipped] = []
+    culls: list[Metric] = []
     tables, logs = inputs.shards("filter_occlusion"), inputs.shards("ingest")
     seen = {shard: _seen(path, config) for shard, path in tables.items()}
     if any(log.held_out for log in seen.values()) and not any(log.training for log in seen.values()):
@@ -116,7 +120,8 @@ def run(
             log, observed.views, observed.training, observed.held_out, library, renderer, lpips, comparison,
             report,
         )  # fmt: skip
-        _picture_whole_frames(log, log_scored, renderer, config.whole_frames, pictures)
+        frames = _picture_whole_frames(log, log_scored, renderer, config.whole_frames, pictures)
+        culls += _culls(log, renderer, frames)
         scored += log_scored
         skipped += log_skipped
 
@@ -131,7 +136,9 @@ def run(
     _picture_actors(scored, config.pictured_actors, pictures)
     pictures.write()
     setting = config.split.setting
-    return [Metric(*mean) for mean in means(observations, setting)] + _counts(scored, skipped, setting)
+    return (
+        [Metric(*mean) for mean in means(observations, setting)] + _counts(scored, skipped, setting) + culls
+    )
 
 
 @dataclass(frozen=True)
@@ -244,26 +251,58 @@ def _picture_actors(scored: list[Scored], count: int, pictures: PictureList) -> 
 
 
 def _picture_whole_frames(
-    log: Log, scored: list[Scored], renderer: ImageRenderer, count: int, pictures: PictureList
-) -> None:
-    """Whole test frames beside their renders: those with the most moved observations come first."""
+    log: Log, scored: list[Scored], renderer: SceneRenderer, count: int, pictures: PictureList
+) -> list[RegionView]:
+    """Whole test frames beside their renders, which are returned: those with the most moved observations first."""
     from collections import Counter
 
     from genassets.evaluation.pictures import side_by_side
     from genassets.evaluation.sparse_view import image_scale
 
+    frames: list[RegionView] = []
     weights: Counter[tuple[str, int]] = Counter()
     for item in scored:
         weights[item.observation.camera, item.observation.frame] += 100 if item.group == "moved" else 1
     for (camera, frame), _ in sorted(weights.items(), key=lambda entry: (-entry[1], entry[0]))[:count]:
         truth = image_scale(log, camera, renderer).image(log.cameras[camera].image(frame))
-        rendered = renderer.render_image(log, camera, frame)
+        frames.append(renderer.render_region(log, camera, frame))
         pictures.add(
             f"frame_{log.name}_{camera}_{frame:03d}",
-            side_by_side([truth, rendered], least_width=WHOLE_FRAME_WIDTH),
+            side_by_side([truth, frames[-1].rgb], least_width=WHOLE_FRAME_WIDTH),
             f"Log {log.name}, {camera}, held-out frame {frame}",
             "Stored image at the compared size (left) and the composited render (right).",
         )
+    return frames
+
+
+def _culls(log: Log, renderer: SceneRenderer, frames: list[RegionView]) -> list[Metric]:
+    """What rendering the whole frames of a log started from and what each cull left, as means over the frames."""
+    if not frames:
+        return []
+    library = renderer.library
+    numbers = [frame.counts.numbers() for frame in frames]
+
+    def mean(name: str) -> float:
+        total = sum(number[name] for number in numbers) / len(frames)
+        return total if name.startswith("actors_") else round(total)
+
+    cells = library.occupancy[log.name].cells
+    in_view = sum(frame.actors_in_view for frame in frames) / len(frames)
+    in_library = len(library.indices_of_log(log.name))
+    pairs: dict[str, tuple[float, float]] = {
+        "actors_in_library": (len(log.tracks), in_library),
+        "actors_in_view": (in_library, in_view),
+        "actors_with_samples": (mean("actors_met"), mean("actors_left")),
+        "actor_samples": (mean("actor_in_boxes"), mean("actor_near_surface")),
+        "background_cells": (cells.numel(), int(cells.sum())),
+        "background_samples": (mean("background_outside_boxes"), mean("background_occupied")),
+        "weighed_samples": (mean("evaluated"), mean("shaded")),
+    }
+    return [
+        Metric(f"culls/{what}", f"test/{log.name}", "all", name, value, len(frames), CULL_METHOD)
+        for what, pair in pairs.items()
+        for name, value in zip(("before", "after"), pair, strict=True)
+    ]
 
 
 def needed_files(config: EvaluateReconstructionConfig) -> dict[str, str]:
