@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -25,7 +27,9 @@ class RememberedPlanes:
         """Planes of one or more actors in single precision; what is not remembered is decoded from mean codes."""
         missing = [actor for actor in actors.tolist() if actor not in self._planes]
         index = torch.tensor(missing, dtype=torch.long)
-        decoded = model.decode(index, model.latents(index).code) if missing else []
+        decoded: Sequence[Tensor] = []
+        if missing:
+            decoded = tuple(model.decode(index, model.latents(index).code))
         fresh = dict(zip(missing, decoded, strict=True))
         return torch.stack([fresh[a] if a in fresh else self._planes[a].float() for a in actors.tolist()])
 

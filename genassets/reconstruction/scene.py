@@ -210,7 +210,7 @@ def lidar_rays(
     from_centre = np.linalg.norm(to_centre, axis=1)
     radii = actors.radii(padding)
     longest = distance.max(initial=0.0)
-    for row in np.flatnonzero(from_centre - radii < longest):
+    for row in np.flatnonzero(from_centre - radii < longest).tolist():
         along = direction @ to_centre[row]
         # Rays that meet the sphere around the box: few, and only they can go through the box.
         near = np.flatnonzero((along > 0) & (along**2 >= from_centre[row] ** 2 - radii[row] ** 2))

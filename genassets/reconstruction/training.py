@@ -129,10 +129,10 @@ class Trainer:
                 The step has then changed nothing of `state`.
         """
         shares = self._workers.map(self._share, range(self.settings.views))
-        for parameter, gradients in zip(
+        for parameter, parts in zip(
             self._parameters, zip(*(share.gradients for share in shares), strict=True), strict=True
         ):
-            parameter.grad = _sum(gradients)
+            parameter.grad = _sum(parts)
         gradients = _gradients(self.model)
         result = _joined([share.result for share in shares])
         if not torch.isfinite(get_total_norm(value for values in gradients.values() for value in values)):
@@ -184,7 +184,7 @@ class Trainer:
         swapped = self._mirrored_actors(generator)
         rays = mirrored(batch.rays, swapped)
         culled = cull(rays, model.coarse_actors(), rendering, generator)
-        actors, bystanders = self._split_actors(culled.samples_of_actors(rays))
+        actors, bystanders = self._split_actors(culled.samples_of_actors(rays), generator)
         latents = model.latents(actors, generator)
         decoded = model.decode(actors, latents.code)
         planes = torch.cat((decoded, self.planes.of(model, bystanders))) if len(bystanders) else decoded
@@ -264,12 +264,20 @@ class Trainer:
             self.model.refresh_coarse_distance(stalest, shares[0].fields)
             self.refreshed[stalest] = self.step + 1
 
-    def _split_actors(self, samples: Tensor) -> tuple[Tensor, Tensor]:
-        """Actors to decode and learn from, those with most samples; and the others that are met."""
-        order = torch.argsort(samples, descending=True, stable=True)
-        met = order[: max(int((samples > 0).sum()), 1)]
+    def _split_actors(self, samples: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
+        """Actors to decode and learn from, and the others that are met.
+
+        Drawn in proportion to the square root of their samples: by samples alone the near ones of a full view would
+        always keep out the far ones.
+        """
+        met = torch.nonzero(samples)[:, 0] if samples.any() else torch.zeros(1, dtype=torch.long)
+        chance = samples[met].double().sqrt().clamp(min=1)
+        if generator is not None:
+            # The largest of these keys are a draw without replacement (Efraimidis and Spirakis 2006).
+            chance = torch.rand(len(met), generator=generator, dtype=torch.float64).log() / chance
+        order = met[torch.argsort(chance, descending=True, stable=True)]
         learned = self.settings.decoded_actors
-        return met[:learned].sort().values, met[learned:].sort().values
+        return order[:learned].sort().values, order[learned:].sort().values
 
     def _set_rates(self) -> None:
         final = self.settings.rates.final
