@@ -12,6 +12,7 @@ from genassets.driving.classes import CAMERA_NAMES, CLASSES, NIGHT_LOGS, VEHICLE
 from genassets.driving.log import CameraStream, Log, Sweep, Track
 from genassets.driving.pandaset import open_log
 from genassets.driving.pandaset_writer import PandasetWriter, write_pandaset
+from genassets.driving.steady import steady_heights
 
 __all__ = [
     "CAMERA_NAMES",
@@ -29,5 +30,6 @@ __all__ = [
     "class_of",
     "count_actor_points",
     "open_log",
+    "steady_heights",
     "write_pandaset",
 ]

@@ -36,7 +36,10 @@ def ingested_root(path: Path) -> Path:
 
 
 def open_ingested(path: Path) -> Log:
-    """The log of an ingest object's directory."""
-    from genassets.driving import open_log
+    """The log of an ingest object's directory, its moving actors at steadied heights.
 
-    return open_log(ingested_root(path))
+    What writes boxes as they were annotated opens `ingested_root` itself.
+    """
+    from genassets.driving import open_log, steady_heights
+
+    return steady_heights(open_log(ingested_root(path)))
