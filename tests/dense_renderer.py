@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 
 from genassets.fields.background import contract
+from genassets.fields.shadow import FOOTPRINT_MARGIN
 from genassets.rendering.rays import BOX_PADDING, Rays
 from genassets.rendering.renderer import (
     ACTOR_REFERENCE_STEP,
     BACKGROUND_REFERENCE_STEP,
     BACKGROUND_START,
+    SHADOW_REACH,
     ActorFields,
     BackgroundFields,
     RenderSettings,
@@ -76,6 +78,7 @@ def render_ray(
             start += step
     if background is not None:
         for distance, alpha, feature in background_samples(rays, index, background, settings):
+            feature = shaded(feature, rays, index, distance, actors)
             samples.append((distance, alpha, feature, distance >= settings.background_far))
     samples.sort(key=lambda sample: sample[0])
     light, feature, expected, solid = 1.0, torch.zeros_like(samples[0][2]), 0.0, 0.0
@@ -87,6 +90,26 @@ def render_ray(
             solid += weight
         light *= 1 - alpha
     return feature, expected, solid
+
+
+def shaded(feature: Tensor, rays: Rays, index: int, distance: float, actors: ActorFields) -> Tensor:
+    """A background sample's feature, darkened by every actor whose bottom plane it is near; colours around 0.5."""
+    grey = torch.tensor([0.5, 0.5, 0.5] + [0.0] * (len(feature) - 3))
+    prints = rays.footprints
+    for number in np.flatnonzero(prints.ray.numpy() == index):
+        height = (float(prints.distance[number]) - distance) * float(prints.descent[number])
+        if actors.shadow is None or abs(height) > SHADOW_REACH:
+            continue
+        actor, place = int(prints.actor[number]), prints.place[number]
+        size = actors.size[actor]
+        padded = size / 2 + torch.tensor(BOX_PADDING)
+        inputs = triplane(actors.planes[int(actors.slot[actor])], torch.cat((place, -size[2:] / 2)) / padded)
+        outside = max(0.0, *(place.abs() - size[:2] / 2).tolist())
+        fade = 1 - outside / FOOTPRINT_MARGIN
+        relative = place / (size[:2] / 2 + FOOTPRINT_MARGIN)
+        out = actors.shadow.network(torch.cat((inputs, relative, torch.tensor([fade]))))
+        feature = (feature + grey) * (1 + torch.exp(out)) ** -fade - grey
+    return feature
 
 
 def background_samples(

@@ -13,7 +13,7 @@ from genassets.fields.feature_field import FeatureField
 from genassets.geometry.transforms import yaw_pose
 from genassets.rendering.compositing import accumulate, depth_order, render_weights
 from genassets.rendering.occupancy import background_occupancy, coarse_distance, prior_distance
-from genassets.rendering.rays import BOX_PADDING, Hits, Rays, cast_rays, concatenate_rays
+from genassets.rendering.rays import BOX_PADDING, Footprints, Hits, Rays, cast_rays, concatenate_rays
 from genassets.rendering.renderer import (
     ActorFields,
     BackgroundFields,
@@ -33,14 +33,15 @@ CAR = np.array([4.0, 2.0, 1.5])
 def double(rays: Rays) -> Rays:
     """The rays in float64, for comparisons and gradient checks."""
 
-    def cast(part: Rays | Hits) -> dict:
+    def cast(part: Rays | Hits | Footprints) -> dict:
         values = {f.name: getattr(part, f.name) for f in dataclasses.fields(part)}
         return {
             k: v.double() if isinstance(v, torch.Tensor) and v.is_floating_point() else v
             for k, v in values.items()
         }
 
-    return Rays(**(cast(rays) | {"hits": Hits(**cast(rays.hits))}))
+    parts = {"hits": Hits(**cast(rays.hits)), "footprints": Footprints(**cast(rays.footprints))}
+    return Rays(**(cast(rays) | parts))
 
 
 def scene(actors: int = 2, seed: int = 0) -> tuple[ActorFields, BackgroundFields, CoarseActors]:

@@ -7,6 +7,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+MID_GREY = 0.5
+"""The colour that features of 0 stand for: the first three are a coarse image around it."""
+
 
 class FeatureField(nn.Module):
     """Triplane features to an SDF value, and with the view direction to a neural feature (paper eq. 1).

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from genassets.fields.shadow import FOOTPRINT_MARGIN
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
 
@@ -34,16 +35,33 @@ class Hits:
 
 
 @dataclass(frozen=True)
+class Footprints:
+    """Where rays meet the planes of actors' bottoms from above, in their labelled boxes' footprints grown by
+    FOOTPRINT_MARGIN: one entry a ray-actor pair.
+
+    place is x, y in the box frame, distance along the ray; descent is how much a ray falls in the box frame a metre.
+    """
+
+    ray: Int[Tensor, " footprints"]
+    actor: Int[Tensor, " footprints"]
+    place: Float[Tensor, "footprints 2"]
+    distance: Float[Tensor, " footprints"]
+    descent: Float[Tensor, " footprints"]
+
+
+@dataclass(frozen=True)
 class Rays:
     """Rays of one log, in its scene frame (metres, float32), with unit directions.
 
-    limit is the distance up to which a ray is followed; infinite for camera rays.
+    limit is the distance up to which a ray is followed; infinite for camera rays. There are footprints only where
+    they were asked for.
     """
 
     origin: Float[Tensor, "rays 3"]
     direction: Float[Tensor, "rays 3"]
     limit: Float[Tensor, " rays"]
     hits: Hits
+    footprints: Footprints
 
     def __len__(self) -> int:
         return len(self.origin)
@@ -58,15 +76,17 @@ def cast_rays(
     limit: NDArray[np.float64] | None = None,
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
+    footprints: bool = False,
 ) -> Rays:
     """Intersect rays with the padded boxes of some actors, in float64, before anything is cast down.
 
     origins and directions (rays, 3) in the scene frame; actors are indices into the library, with their
     poses (actors, 4, 4) and sizes (actors, 3) as length, width, height. With dtype float64 nothing is cast down:
-    what float32 is compared with.
+    what float32 is compared with. footprints: whether to look for what actors shade too.
     """
     limit = np.full(len(origins), np.inf) if limit is None else limit
     parts: list[tuple[NDArray, ...]] = []
+    shaded: list[tuple[NDArray, ...]] = []
     for index, pose, size in zip(actors, scene_from_box, sizes, strict=True):
         box_from_scene = invert_pose(pose)
         origin = transform_points(box_from_scene, origins)
@@ -75,8 +95,12 @@ def cast_rays(
         near, far = np.maximum(near, 0.0), np.minimum(far, limit)
         hit = np.flatnonzero(near < far)
         parts.append((hit, np.full(len(hit), index), origin[hit], direction[hit], near[hit], far[hit]))
-    empty = (np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
-    ray, actor, *rest = (np.concatenate(column) for column in zip(empty, *parts, strict=True))
+        if footprints:
+            met, *at = _on_the_ground(origin, direction, size)
+            shaded.append((met, np.full(len(met), index), *at))
+    number, length, vector = np.zeros(0, int), np.zeros(0), np.zeros((0, 3))
+    ray, actor, *rest = _columns(parts, (number, number, vector, vector, length, length))
+    below, owner, *at = _columns(shaded, (number, number, vector[:, :2], length, length))
 
     def cast(array: NDArray) -> Tensor:
         return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
@@ -84,13 +108,33 @@ def cast_rays(
     hits = Hits(
         torch.as_tensor(ray, device=device), torch.as_tensor(actor, device=device), *(cast(a) for a in rest)
     )
-    return Rays(cast(origins), cast(directions), cast(limit), hits)
+    ground = Footprints(
+        torch.as_tensor(below, device=device), torch.as_tensor(owner, device=device), *(cast(a) for a in at)
+    )
+    return Rays(cast(origins), cast(directions), cast(limit), hits, ground)
+
+
+def _columns(rows: Sequence[tuple[NDArray, ...]], empty: tuple[NDArray, ...]) -> list[NDArray]:
+    return [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+
+
+def _on_the_ground(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], size: NDArray[np.float64]
+) -> tuple[NDArray, ...]:
+    """Rays (N, 3) of a box frame that meet its grown footprint: their numbers, places (n, 2), distances, descents."""
+    falling = np.flatnonzero((direction[:, 2] < 0) & (origin[:, 2] > -size[2] / 2))
+    descent = -direction[falling, 2]
+    distance = (origin[falling, 2] + size[2] / 2) / descent
+    place = origin[falling, :2] + distance[:, None] * direction[falling, :2]
+    inside = np.all(np.abs(place) < size[:2] / 2 + FOOTPRINT_MARGIN, axis=1)
+    return falling[inside], place[inside], distance[inside], descent[inside]
 
 
 def mirrored(rays: Rays, chosen: Bool[Tensor, " actors"]) -> Rays:
     """The rays as they would meet the chosen actors (by index in the library) were those their mirror images.
 
-    Left and right change places in the box frame; distances along rays stay, because boxes are symmetric.
+    Left and right change places in the box frame; distances along rays stay, because boxes are symmetric. Shadows stay
+    too: the sun has a side.
     """
     swap = chosen[rays.hits.actor]
     origin, direction = mirror_where(rays.hits.origin, swap), mirror_where(rays.hits.direction, swap)
@@ -105,7 +149,7 @@ def mirror_where(vectors: Float[Tensor, "n 3"], swap: Bool[Tensor, " n"]) -> Flo
 def concatenate_rays(parts: Sequence[Rays]) -> Rays:
     """One batch from several, ray numbers shifted accordingly."""
     starts = np.cumsum([0, *(len(part) for part in parts)])
-    hits = [part.hits for part in parts]
+    hits, prints = [part.hits for part in parts], [part.footprints for part in parts]
     return Rays(
         torch.cat([part.origin for part in parts]),
         torch.cat([part.direction for part in parts]),
@@ -117,5 +161,12 @@ def concatenate_rays(parts: Sequence[Rays]) -> Rays:
             torch.cat([h.direction for h in hits]),
             torch.cat([h.near for h in hits]),
             torch.cat([h.far for h in hits]),
+        ),
+        Footprints(
+            torch.cat([p.ray + int(start) for p, start in zip(prints, starts, strict=False)]),
+            torch.cat([p.actor for p in prints]),
+            torch.cat([p.place for p in prints]),
+            torch.cat([p.distance for p in prints]),
+            torch.cat([p.descent for p in prints]),
         ),
     )

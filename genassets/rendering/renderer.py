@@ -15,6 +15,7 @@ from torch import Tensor
 from genassets.fields.background import contract
 from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import log_transmittance
+from genassets.fields.shadow import ShadowHead, darken
 from genassets.fields.shape_prior import bounded_distance
 from genassets.fields.triplane import interpolate_triplanes
 from genassets.rendering.compositing import OPAQUE, accumulate, depth_order, log_light, render_weights
@@ -34,6 +35,10 @@ BACKGROUND_REFERENCE_STEP = 0.30
 BACKGROUND_START = 0.1
 """Signed distance in metres that an untrained background has everywhere: thin fog, not a wall."""
 
+
+SHADOW_REACH = 0.5
+"""Metres above and below the plane of an actor's bottom within which the background is darkened: roads aren't planes,
+and a sample stands for a step along a ray."""
 
 CLEAR_BEYOND = 4.0
 """A sample is in the clear where beta x sdf exceeds this: its opacity is then below 2 %."""
@@ -75,13 +80,17 @@ class CoarseActors:
 
 @dataclass(frozen=True)
 class ActorFields:
-    """Decoded actors. slot maps an actor's index in the library to the place of its planes."""
+    """Decoded actors. slot maps an actor's index in the library to the place of its planes.
+
+    shadow: what actors do to the ground around them, where there is a model of it.
+    """
 
     field: FeatureField
     beta: Float[Tensor, ""]
     planes: Float[Tensor, "slots 3 channels height width"]
     slot: Int[Tensor, " actors"]
     size: Float[Tensor, "actors 3"]
+    shadow: ShadowHead | None = None
 
 
 @dataclass(frozen=True)
@@ -103,19 +112,20 @@ class Culled:
     in_boxes: int
 
     def samples_of_actors(self, rays: Rays) -> Int[Tensor, " actors"]:
-        """How many samples each actor has left, by index, up to the last actor that has any."""
-        return torch.bincount(rays.hits.actor[self.samples.hit], minlength=1)
+        """How many samples and places that it may shade each actor has left, by index, up to the last that has any."""
+        actor = torch.cat((rays.hits.actor[self.samples.hit], rays.footprints.actor))
+        return torch.bincount(actor, minlength=1)
 
 
 @dataclass(frozen=True)
 class SampleCounts:
     """What there was before and after each cull; counts of several renderings can be added.
 
-    actors_met are the actors whose padded boxes rays cross, actors_left those that the coarse distance leaves
-    any sample; only these are looked up. actor_in_boxes and actor_near_surface are samples before and after the
-    coarse distance, background_outside_boxes and background_occupied before and after the LiDAR occupancy. The
-    weight of every `evaluated` sample was worked out: what those culls left, and the sky. `shaded` samples
-    weigh enough to get features (and gradients).
+    actors_met are the actors whose padded boxes or grown footprints rays cross, actors_left those that the coarse
+    distance leaves any sample, or that may shade; only these are looked up. actor_in_boxes and actor_near_surface
+    are samples before and after the coarse distance, background_outside_boxes and background_occupied before and
+    after the LiDAR occupancy. The weight of every `evaluated` sample was worked out: what those culls left, and the
+    sky. `shaded` samples weigh enough to get features (and gradients).
     """
 
     actors_met: frozenset[int]
@@ -225,7 +235,7 @@ def render_rays(
     feature = actors.field.feature(evaluated.actor_intermediate, rays.hits.direction[seen.hit])
     if background is not None:
         behind = background.field.feature(evaluated.background_intermediate, rays.direction[static.ray])
-        feature = torch.cat((feature, behind))
+        feature = torch.cat((feature, _shaded(behind, static, rays, actors)))
     order = depth_order(evaluated.ray, evaluated.distance)
     ray = evaluated.ray[order]
     weight = render_weights(evaluated.log_transmittance[order], ray)
@@ -246,7 +256,7 @@ def render_rays(
         sums[:, 1],
         in_free_space,
         SampleCounts(
-            _numbers_of(torch.bincount(rays.hits.actor)),
+            _numbers_of(torch.bincount(torch.cat((rays.hits.actor, rays.footprints.actor)))),
             _numbers_of(culled.samples_of_actors(rays)),
             culled.in_boxes,
             len(occupied.hit),
@@ -307,6 +317,36 @@ def _evaluate(
         intermediate,
         static_intermediate,
     )
+
+
+def _shaded(
+    feature: Float[Tensor, "samples channels"], static: BackgroundSamples, rays: Rays, actors: ActorFields
+) -> Float[Tensor, "samples channels"]:
+    """Features of background samples in the light that actors leave: of those near the plane of an actor's bottom
+    whose rays meet its footprint.
+    """
+    prints = rays.footprints
+    if actors.shadow is None or not len(prints.ray):
+        return feature
+    order = torch.argsort(prints.ray, stable=True)
+    count = torch.bincount(prints.ray, minlength=len(rays))
+    first = count.cumsum(0) - count
+    pairs = count[static.ray]  # every sample with every footprint that its ray meets
+    sample = torch.repeat_interleave(torch.arange(len(pairs), device=pairs.device), pairs)
+    rank = torch.arange(len(sample), device=pairs.device) - (pairs.cumsum(0) - pairs)[sample]
+    met = order[first[static.ray[sample]] + rank]
+    height = (prints.distance[met] - static.distance[sample]) * prints.descent[met]
+    near = height.abs() <= SHADOW_REACH
+    sample = sample[near]
+    needed, entry = met[near].unique(return_inverse=True)
+    actor, place = prints.actor[needed], prints.place[needed]
+    size = actors.size[actor]
+    position = torch.cat((place, -size[:, 2:] / 2), dim=-1)
+    plane_features = interpolate_triplanes(
+        actors.planes, actors.slot[actor], position / padded_half_size(actors.size)[actor]
+    )
+    log_light = actors.shadow.log_light(plane_features, place, size[:, :2])
+    return darken(feature, torch.zeros_like(feature).index_add(0, sample, log_light[entry]))
 
 
 def _background_samples(

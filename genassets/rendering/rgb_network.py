@@ -7,6 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from genassets.fields.feature_field import MID_GREY
+
 
 class RgbNetwork(nn.Module):
     """Residual blocks without normalisation, with 2x upsampling after the second and the fourth.
@@ -54,7 +56,7 @@ class RgbNetwork(nn.Module):
             if index in self.upsample_after:
                 x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
         coarse = F.interpolate(feature_map[:, :3], x.shape[-2:], mode="bilinear", align_corners=False)
-        return 0.5 + coarse + self.image(x)
+        return MID_GREY + coarse + self.image(x)
 
 
 class _Block(nn.Module):
