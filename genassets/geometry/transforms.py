@@ -142,6 +142,12 @@ def interpolate_pose(times: ArrayLike, poses: ArrayLike, time: float) -> Array:
         return poses[-1].copy()
     before = after - 1
     fraction = float((time - times[before]) / (times[after] - times[before]))
-    q0, q1 = quaternion_from_rotation(poses[[before, after], :3, :3])
-    position = (1 - fraction) * poses[before, :3, 3] + fraction * poses[after, :3, 3]
+    return pose_between(poses[before], poses[after], fraction)
+
+
+def pose_between(start: ArrayLike, end: ArrayLike, fraction: float) -> Array:
+    """Pose (4, 4) at a fraction of a steady motion between two; below 0 and above 1 the motion goes on."""
+    both = np.stack([np.asarray(start, np.float64), np.asarray(end, np.float64)])
+    q0, q1 = quaternion_from_rotation(both[:, :3, :3])
+    position = (1 - fraction) * both[0, :3, 3] + fraction * both[1, :3, 3]
     return make_pose(rotation_from_quaternion(slerp(q0, q1, fraction)), position)

@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from genassets.driving import Log, Track, actor_mask
+from genassets.driving.log import CameraStream
 from genassets.driving.sweep import SPINNING, SPINNING_POSITION
+from genassets.fields.shadow import FOOTPRINT_MARGIN
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import Intrinsics, pixel_directions, project_box, spheres_in_image
-from genassets.geometry.transforms import invert_pose, transform_directions, transform_points
+from genassets.geometry.transforms import invert_pose, pose_between, transform_directions, transform_points
 from genassets.rendering.rays import BOX_PADDING
 
 Array = NDArray[np.float64]
+
+REACH = (FOOTPRINT_MARGIN, FOOTPRINT_MARGIN, BOX_PADDING[2])
+"""Metres around a box, along length, width and height, in which rays meet an actor or the ground that it shades."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +43,16 @@ class SceneFrame:
 
 @dataclass(frozen=True)
 class PlacedActors:
-    """Actors of one instant: library index (A,), scene_from_box (A, 4, 4), sizes (A, 3) as l, w, h."""
+    """Actors of one instant: library index (A,), scene_from_box (A, 4, 4), sizes (A, 3) as l, w, h.
+
+    read_out (A, 2, 4, 4): scene_from_box when an image's upper and when its lower edge is read; None where all is
+    seen at once.
+    """
 
     index: NDArray[np.int64]
     scene_from_box: Array
     sizes: Array
+    read_out: Array | None = None
 
     @classmethod
     def of(cls, tracks: Sequence[Track], poses: Sequence[Array], index: Mapping[str, int]) -> PlacedActors:
@@ -54,7 +64,14 @@ class PlacedActors:
         )
 
     def select(self, keep: NDArray) -> PlacedActors:
-        return PlacedActors(self.index[keep], self.scene_from_box[keep], self.sizes[keep])
+        read_out = None if self.read_out is None else self.read_out[keep]
+        return PlacedActors(self.index[keep], self.scene_from_box[keep], self.sizes[keep], read_out)
+
+    def at(self, share: float) -> PlacedActors:
+        """The actors at a share of the read-out, 0 at the image's upper edge and 1 at its lower."""
+        assert self.read_out is not None
+        poses = [pose_between(first, last, share) for first, last in self.read_out]
+        return PlacedActors(self.index, np.array(poses).reshape(-1, 4, 4), self.sizes)
 
     def radii(self, padding: Sequence[float]) -> Array:
         """Radii (A,) in metres of the spheres around the boxes with `padding` metres on every side."""
@@ -79,7 +96,9 @@ class View:
     """One camera at one frame, at the rendered size, with the actors in the image.
 
     bounds (A, 4): x0, y0, x1, y1 of each actor's box in pixels of the rendered image. padded_bounds (A, 4): the
-    same of its padded box, not clipped to the image: outside them no ray meets the actor.
+    same of its padded box and grown footprint, not clipped to the image: outside them no ray meets the actor.
+    read_out (2, 4, 4): scene_from_camera when the image's upper and when its lower edge is read; None where all rows
+    are read at once. scene_from_camera and bounds hold when the middle row is read.
     """
 
     camera: str
@@ -89,11 +108,23 @@ class View:
     actors: PlacedActors
     bounds: Array
     padded_bounds: Array
+    read_out: Array | None = None
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Origins and unit directions (N, 3) in the scene frame of the rays through pixels (N, 2)."""
+        """Origins and unit directions (N, 3) in the scene frame of the rays through pixels (N, 2) of the middle row's
+        instant.
+        """
         directions = transform_directions(self.scene_from_camera, pixel_directions(self.intrinsics, pixels))
         return np.broadcast_to(self.scene_from_camera[:3, 3], directions.shape), directions
+
+    def when_read(self, row: float, actors: PlacedActors) -> tuple[View, PlacedActors]:
+        """The view and actors of it as they are when a row of pixels is read; rows beyond the image go on in time."""
+        if self.read_out is None:
+            return self, actors
+        share = row / self.intrinsics.height
+        pose = pose_between(self.read_out[0], self.read_out[1], share)
+        moved = replace(self, scene_from_camera=pose, read_out=None)
+        return moved, actors.at(share)
 
     def actors_in(self, region: tuple[float, float, float, float]) -> PlacedActors:
         """The actors that rays through a region (x0, y0, x1, y1), which may leave the image, can meet."""
@@ -131,22 +162,60 @@ def rendered_intrinsics(stored: Intrinsics, scale: float, stride: int) -> Intrin
 
 
 def placed_actors(
-    log: Log, frame: int, time: float, index: Mapping[str, int], scene: SceneFrame
+    log: Log,
+    frame: int,
+    time: float,
+    index: Mapping[str, int],
+    scene: SceneFrame,
+    rolling_shutter: float = 0.0,
 ) -> PlacedActors:
-    """The log's actors that have an index, as they stand at a time within a frame."""
+    """The log's actors that have an index, as they stand at a time within a frame, in the middle of a read-out."""
     tracks = [track for track in log.tracks if track.actor_id in index and track.covers(frame)]
     poses = [scene.pose(track.pose_at(time)) for track in tracks]
-    return PlacedActors.of(tracks, poses, index)
+    placed = PlacedActors.of(tracks, poses, index)
+    if not rolling_shutter:
+        return placed
+    edges = [time - rolling_shutter / 2, time + rolling_shutter / 2]
+    read_out = [[scene.pose(track.pose_at(edge)) for edge in edges] for track in tracks]
+    return replace(placed, read_out=np.array(read_out).reshape(-1, 2, 4, 4))
+
+
+def camera_read_out(stream: CameraStream, frame: int, rolling_shutter: float) -> Array:
+    """World_from_camera (2, 4, 4) when a frame's first and last row are read, `rolling_shutter` seconds apart.
+
+    The frame's stamp is taken for the middle. Between two frames the camera moves steadily; at the log's ends it goes
+    on as between the last two.
+    """
+    poses, times = stream.world_from_camera, stream.times
+    if len(times) < 2:
+        return np.stack([poses[frame]] * 2)
+    edges = []
+    for time in (times[frame] - rolling_shutter / 2, times[frame] + rolling_shutter / 2):
+        before = min(max(int(np.searchsorted(times, time, side="right")) - 1, 0), len(times) - 2)
+        share = float((time - times[before]) / (times[before + 1] - times[before]))
+        edges.append(pose_between(poses[before], poses[before + 1], share))
+    return np.stack(edges)
 
 
 def make_view(
-    log: Log, camera: str, frame: int, index: Mapping[str, int], scene: SceneFrame, scale: float, stride: int
+    log: Log,
+    camera: str,
+    frame: int,
+    index: Mapping[str, int],
+    scene: SceneFrame,
+    scale: float,
+    stride: int,
+    rolling_shutter: float = 0.0,
 ) -> View:
-    """The view of a camera at a frame, with moving actors where they are at the camera's own time stamp."""
+    """The view of a camera at a frame, with moving actors where they are at the camera's own time stamp.
+
+    rolling_shutter: seconds in which the rows are read one after the other, from the upper edge to the lower.
+    """
     stream = log.cameras[camera]
     intrinsics = rendered_intrinsics(stream.intrinsics, scale, stride)
-    actors = placed_actors(log, frame, float(stream.times[frame]), index, scene)
+    actors = placed_actors(log, frame, float(stream.times[frame]), index, scene, rolling_shutter)
     scene_from_camera = scene.pose(stream.world_from_camera[frame])
+    read_out = scene.pose(camera_read_out(stream, frame, rolling_shutter)) if rolling_shutter else None
     camera_from_scene = invert_pose(scene_from_camera)
     centres = transform_points(camera_from_scene, actors.scene_from_box[:, :3, 3])
     # Most of a log's actors are elsewhere: their boxes are not even projected.
@@ -154,12 +223,17 @@ def make_view(
     visible = np.zeros(len(actors.index), dtype=bool)
     bounds, padded_bounds = [], []
     for row, (pose, size) in enumerate(zip(actors.scene_from_box, actors.sizes, strict=True)):
-        box = project_box(intrinsics, camera_from_scene @ pose, size)
-        padded = project_box(intrinsics, camera_from_scene @ pose, size + 2 * np.array(BOX_PADDING))
-        if box is not None and padded is not None:
-            visible[row] = True
-            bounds.append(box.bounds)
-            padded_bounds.append([*padded.hull.min(axis=0), *padded.hull.max(axis=0)])
+        camera_from_box = [camera_from_scene @ pose]
+        box = project_box(intrinsics, camera_from_box[0], size)
+        if box is None:
+            continue
+        if read_out is not None and actors.read_out is not None:
+            camera_from_box += list(invert_pose(read_out) @ actors.read_out[row])
+        padded = [project_box(intrinsics, p, size + 2 * np.array(REACH)) for p in camera_from_box]
+        corners = np.concatenate([p.hull for p in padded if p is not None])
+        visible[row] = True
+        bounds.append(box.bounds)
+        padded_bounds.append([*corners.min(axis=0), *corners.max(axis=0)])
     return View(
         camera,
         frame,
@@ -168,6 +242,7 @@ def make_view(
         actors.select(visible),
         np.array(bounds, dtype=np.float64).reshape(-1, 4),
         np.array(padded_bounds, dtype=np.float64).reshape(-1, 4),
+        read_out,
     )
 
 

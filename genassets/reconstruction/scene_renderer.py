@@ -101,8 +101,10 @@ class SceneRenderer:
         """The view of a camera at a frame with the library's actors in it."""
         index = self.library.indices_of_log(log.name)
         scene = self.library.scenes[log.name]
-        scale, stride = self.library.settings.image_scale, self.library.model.stride
-        return make_view(log, camera, frame, index, scene, scale, stride)
+        settings, stride = self.library.settings, self.library.model.stride
+        return make_view(
+            log, camera, frame, index, scene, settings.image_scale, stride, settings.rolling_shutter
+        )
 
     def render_image(
         self, log: Log, camera: str, frame: int, region: tuple[int, int, int, int] | None = None

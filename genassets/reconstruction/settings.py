@@ -104,6 +104,11 @@ class ReconstructionSettings(_Settings):
     image_scale: Annotated[float, Field(gt=0, le=1)] = Field(
         default=0.25, description="size of rendered images as a share of the log's images"
     )
+    rolling_shutter: Weight = Field(
+        default=0.0,
+        description="seconds in which a camera reads its rows, from the upper edge to the lower, with its stamp in "
+        "the middle; 0: all at once",
+    )
     steps: PositiveInt = 1500
     views: PositiveInt = Field(
         default=2, description="views of a step; where there are cores, they are learned from side by side"

@@ -153,7 +153,8 @@ def prepare_training(
         scene = scene_frame(log)
         everyone = {track.actor_id: number for number, track in enumerate(log.tracks)}
         shots = training_frames(log, cameras, is_training)
-        views = [make_view(log, name, f, everyone, scene, settings.image_scale, stride) for name, f in shots]
+        scale, read_out = settings.image_scale, settings.rolling_shutter
+        views = [make_view(log, name, f, everyone, scene, scale, stride, read_out) for name, f in shots]
         observed = [_observed(view, settings.smallest_actor) for view in views]
         seen = np.zeros(len(log.tracks), dtype=np.int64)
         for view, rows in zip(views, observed, strict=True):
@@ -322,22 +323,48 @@ def _object_patch(
     return rays, ObjectPatch(y1 - y0 + 2 * margin, x1 - x0 + 2 * margin, pixels)
 
 
-def patch_rays(view: View, column: int, row: int, size: int, margin: int, stride: int) -> Rays:
+def patch_rays(
+    view: View, column: int, row: int, size: int, margin: int, stride: int, shadows: bool = False
+) -> Rays:
     """Rays of a square of feature pixels from (column, row), with a margin on every side."""
-    return region_rays(
-        view, (column - margin, row - margin, column + size + margin, row + size + margin), stride
-    )
+    region = (column - margin, row - margin, column + size + margin, row + size + margin)
+    return region_rays(view, region, stride, shadows=shadows)
 
 
 def region_rays(
-    view: View, region: tuple[int, int, int, int], stride: int, dtype: torch.dtype = torch.float32
+    view: View,
+    region: tuple[int, int, int, int],
+    stride: int,
+    dtype: torch.dtype = torch.float32,
+    shadows: bool = False,
 ) -> Rays:
-    """Rays of a region x0, y0, x1, y1 of feature pixels, row by row; it may reach outside the image."""
-    origins, directions = view.rays(pixel_centres(*region) * stride)
+    """Rays of a region x0, y0, x1, y1 of feature pixels, row by row; it may reach outside the image.
+
+    shadows: whether to look for what actors shade too. With a rolling shutter camera and actors stand in each row
+    where they were when its middle was read.
+    """
+    x0, y0, x1, y1 = region
+    if view.read_out is None:
+        return _rays_at_once(view, region, stride, dtype, shadows)
+    rows = [(x0, y, x1, y + 1) for y in range(y0, y1)]
+    return concatenate_rays([_rays_at_once(view, row, stride, dtype, shadows) for row in rows])
+
+
+def _rays_at_once(
+    view: View, region: tuple[int, int, int, int], stride: int, dtype: torch.dtype, shadows: bool
+) -> Rays:
+    """Rays of a region whose middle row's instant holds for all of it."""
     x0, y0, x1, y1 = (edge * stride for edge in region)
-    actors = view.actors_in((x0, y0, x1, y1))
+    view, actors = view.when_read((y0 + y1) / 2, view.actors_in((x0, y0, x1, y1)))
+    origins, directions = view.rays(pixel_centres(*region) * stride)
     return cast_rays(
-        origins, directions, actors.index.tolist(), actors.scene_from_box, actors.sizes, dtype=dtype
+        origins,
+        directions,
+        actors.index.tolist(),
+        actors.scene_from_box,
+        actors.sizes,
+        dtype=dtype,
+        footprints=shadows,
     )
 
 
