@@ -14,6 +14,7 @@ from genassets.fields.asset_decoder import AssetDecoder
 from genassets.fields.background import BackgroundPlanes
 from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import Sharpness
+from genassets.fields.shadow import ShadowHead
 from genassets.reconstruction.settings import ModelSettings
 from genassets.rendering.occupancy import coarse_distance, prior_distance
 from genassets.rendering.renderer import ActorFields, BackgroundFields, CoarseActors
@@ -81,6 +82,11 @@ class AssetModel(nn.Module):
                 settings.rgb_blocks,
                 settings.rgb_upsamplings,
             )
+            self.shadow = (
+                ShadowHead(3 * settings.plane_channels, settings.shadow_hidden, settings.features)
+                if settings.shadow_hidden
+                else None
+            )
         self.beta = Sharpness(settings.sharpness)
         self.background_beta = Sharpness()
         self.backgrounds = nn.ModuleList(
@@ -130,7 +136,7 @@ class AssetModel(nn.Module):
         """The fields of decoded actors, as the renderer takes them."""
         slot = torch.zeros(len(self.sizes), dtype=torch.long, device=self.sizes.device)
         slot[actors] = torch.arange(len(actors), device=slot.device)
-        return ActorFields(self.field, self.beta(), planes, slot, self.sizes)
+        return ActorFields(self.field, self.beta(), planes, slot, self.sizes, self.shadow)
 
     def background_fields(self, log: int, occupancy: OccupancyGrid) -> BackgroundFields:
         """The background of a log, with its LiDAR occupancy."""

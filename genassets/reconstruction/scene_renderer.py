@@ -130,7 +130,7 @@ class SceneRenderer:
         strips, counts = [], []
         for top in range(fy0, fy1, rows_at_once):
             rows = (fx0, top, fx1, min(top + rows_at_once, fy1))
-            rays = region_rays(view, rows, stride, self._dtype)
+            rays = region_rays(view, rows, stride, self._dtype, self.library.model.shadow is not None)
             culled = cull(rays, coarse, self._settings)
             met = torch.nonzero(culled.samples_of_actors(rays))[:, 0].tolist()
             fields = self._fields(met or [0])  # one stands in where none is met

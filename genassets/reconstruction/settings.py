@@ -29,6 +29,9 @@ class ModelSettings(_Settings):
     field_hidden: PositiveInt = 48
     sharpness: PositiveFloat = Field(default=20.0, description="beta at the start, in 1/m")
     features: PositiveInt = 16
+    shadow_hidden: Annotated[int, Field(ge=0)] = Field(
+        default=0, description="width of the network that says how actors shade the ground; 0 leaves it out"
+    )
     background_resolution: PositiveInt = 192
     background_plane_channels: PositiveInt = 8
     background_hidden: PositiveInt = 32

@@ -323,8 +323,9 @@ class Trainer:
 
 def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
     """The dense parameters with their learning rates."""
-    decoder = [*model.decoder.parameters(), model.class_embedding]
-    fields = [*model.field.parameters(), *model.background_field.parameters()]
+    parts = dict(model.named_parameters())
+    decoder = [parts[name] for name in parts if name.startswith(("decoder.", "class_embedding"))]
+    fields = [parts[name] for name in parts if name.startswith(("field.", "background_field.", "shadow."))]
     sharpness = [*model.beta.parameters(), *model.background_beta.parameters()]
     return [
         {"params": decoder, "lr": rates.decoder},

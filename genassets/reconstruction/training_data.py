@@ -274,6 +274,7 @@ def draw_batch(
     number = int(rng.choice(len(data.views), p=of_view / of_view.sum()))
     view = data.views[number]
     candidates = np.flatnonzero(owner == number)
+    shadows = settings.model.shadow_hidden > 0
 
     def draw_observation() -> Observation | None:
         if not len(candidates):
@@ -285,7 +286,9 @@ def draw_batch(
         shown = draw_observation() if rng.random() >= settings.background_share else None
         bounds = shown.bounds if shown else None
         column, row = _place_patch(view, bounds, settings.patch_size, stride, rng)
-        parts.append(patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride))
+        parts.append(
+            patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride, shadows)
+        )
         x, y, extent = column * stride, row * stride, settings.patch_size * stride
         targets.append(data.images[number][y : y + extent, x : x + extent])
     pixels = torch.stack(targets).permute(0, 3, 1, 2).float() / 255
@@ -317,7 +320,8 @@ def _object_patch(
         low = int(rng.integers(low, high - length + 1))
         spans.append((low, low + length))
     (x0, x1), (y0, y1) = spans
-    rays = region_rays(view, (x0 - margin, y0 - margin, x1 + margin, y1 + margin), stride)
+    region = (x0 - margin, y0 - margin, x1 + margin, y1 + margin)
+    rays = region_rays(view, region, stride, shadows=settings.model.shadow_hidden > 0)
     pixels = data.images[shown.view][y0 * stride : y1 * stride, x0 * stride : x1 * stride]
     pixels = pixels.permute(2, 0, 1)[None].float() / 255
     return rays, ObjectPatch(y1 - y0 + 2 * margin, x1 - x0 + 2 * margin, pixels)
