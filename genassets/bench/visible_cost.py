@@ -261,7 +261,7 @@ def _seconds(cases: Sequence[Case], rounds: int, say: Callable[[str], None]) -> 
 def _actor_data_mib(trainer: Trainer) -> float:
     """MiB of what training holds of every actor: codes with their optimiser's two moments, and coarse distances."""
     model = trainer.model
-    held = [model.latent_mean.weight, model.latent_log_variance.weight] * 3 + [model.coarse_distance]
+    held = model.codes() * 3 + [model.coarse_distance]
     return sum(tensor.numel() * tensor.element_size() for tensor in held) / 2**20
 
 

@@ -1,8 +1,9 @@
 """The asset library on disk: what a reconstruction leaves for evaluation, generation and augmentation.
 
 assets.parquet       a row an actor: log, actor_id, actor_class, size_l, size_w, size_h, observations
-latents.safetensors  mean and log_variance (actors, channels, size, size), in the order of the table
-weights.safetensors  decoder, fields, image network, class embeddings, backgrounds, occupancy
+latents.safetensors  mean and log_variance (actors, channels, size, size), in the order of the table; of a model without
+                     decoder the planes alone, as mean (actors, 3 x channels, height, width)
+weights.safetensors  decoder, fields, shadow head, image network, class embeddings, backgrounds, occupancy
 config.json          settings, logs with their scene frames, occupancy grids' places
 """
 
@@ -31,7 +32,9 @@ from genassets.reconstruction.training import build_model
 from genassets.rendering.sampling import OccupancyGrid
 
 FORMAT_VERSION = 1
-LATENTS = ("latent_mean.weight", "latent_log_variance.weight")
+LATENTS = {"mean": "latent_mean.weight", "log_variance": "latent_log_variance.weight"}
+"""Names in latents.safetensors, and of the model's parameters."""
+
 COLUMNS = ("log", "actor_id", "actor_class", "size_l", "size_w", "size_h", "observations")
 
 _Point = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
@@ -87,13 +90,13 @@ class AssetLibrary:
 def save_library(library: AssetLibrary, directory: Path) -> None:
     """Write a library into a directory."""
     directory.mkdir(parents=True, exist_ok=True)
-    state = {name: value.detach().contiguous() for name, value in library.model.state_dict().items()}
+    weights = {name: value.detach().contiguous() for name, value in library.model.state_dict().items()}
     shape = (-1, *library.model.latent_shape)
     latents = {
-        "mean": state[LATENTS[0]].reshape(shape).contiguous(),
-        "log_variance": state[LATENTS[1]].reshape(shape).contiguous(),
+        name: weights.pop(parameter).reshape(shape)
+        for name, parameter in LATENTS.items()
+        if parameter in weights
     }
-    weights = {name: value for name, value in state.items() if name not in LATENTS}
     for log, grid in library.occupancy.items():
         weights[f"lidar_occupancy.{log}"] = grid.cells
     save_file(latents, directory / "latents.safetensors")
@@ -140,7 +143,8 @@ def load_library(directory: Path) -> AssetLibrary:
     names = [log.name for log in config.logs]
     assets = _read_assets(directory / "assets.parquet", names)
     model = build_model(assets, names, config.settings, seed=0)
-    codes = _read_codes(directory / "latents.safetensors", (len(assets), *model.latent_shape))
+    parts = ("mean", "log_variance") if config.settings.model.decoder else ("mean",)
+    codes = _read_codes(directory / "latents.safetensors", parts, (len(assets), *model.latent_shape))
     path = directory / "weights.safetensors"
     with _reading(path, "the weights of the model that config.json and assets.parquet describe"):
         weights = load_file(path)
@@ -173,14 +177,14 @@ def _read_assets(path: Path, logs: Sequence[str]) -> pd.DataFrame:
     return assets
 
 
-def _read_codes(path: Path, shape: tuple[int, ...]) -> dict[str, Tensor]:
+def _read_codes(path: Path, names: Sequence[str], shape: tuple[int, ...]) -> dict[str, Tensor]:
     """The latents under the names of the model's parameters."""
-    with _reading(path, f"mean and log_variance of shape {shape}, a row a row of assets.parquet"):
+    with _reading(path, f"{' and '.join(names)} of shape {shape}, a row a row of assets.parquet"):
         latents = load_file(path)
-        codes = (latents["mean"], latents["log_variance"])
-        if wrong := [tuple(code.shape) for code in codes if tuple(code.shape) != shape]:
+        codes = {name: latents[name] for name in names}
+        if wrong := [tuple(code.shape) for code in codes.values() if tuple(code.shape) != shape]:
             raise ValueError(f"the shape is {wrong[0]}")
-    return {name: code.flatten(1) for name, code in zip(LATENTS, codes, strict=True)}
+    return {LATENTS[name]: code.flatten(1) for name, code in codes.items()}
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,18 +28,22 @@ LOG_VARIANCE_START = -6.0
 
 @dataclass(frozen=True)
 class Latents:
-    """Codes of some actors with the distribution that they were drawn from, each (n, channels, size, size)."""
+    """Codes of some actors with the distribution that they were drawn from, each (n, channels, size, size).
+
+    log_variance is None where nothing is drawn: without a decoder, whose codes are the planes themselves.
+    """
 
     code: Float[Tensor, "n c h w"]
     mean: Float[Tensor, "n c h w"]
-    log_variance: Float[Tensor, "n c h w"]
+    log_variance: Float[Tensor, "n c h w"] | None
 
 
 class AssetModel(nn.Module):
     """Latents and class embeddings -> asset decoder -> triplanes -> fields, and a background a log.
 
     sizes (actors, 3) are l, w, h in metres; class_index (actors,) points into CLASSES. Initial values come
-    from the seed alone.
+    from the seed alone. Without a decoder (settings.decoder) a code is an actor's three planes, and neither embeddings
+    nor variances are there: the paper's ablation.
     """
 
     sizes: Tensor
@@ -54,22 +59,31 @@ class AssetModel(nn.Module):
         generator = torch.Generator().manual_seed(seed)
         actors = len(sizes)
         shape = (settings.latent_channels, settings.latent_size, settings.latent_size)
-        width = settings.latent_channels * settings.latent_size**2
+        if not settings.decoder:
+            side = settings.latent_size * 2 ** (len(settings.decoder_channels) - 1)
+            shape = (3 * settings.plane_channels, side, side)
+        width = math.prod(shape)
         self.latent_shape = shape
         # Sparse gradients: Adam then moves, and keeps the state of, only the codes that a step has met.
         self.latent_mean = nn.Embedding(actors, width, sparse=True)
-        self.latent_log_variance = nn.Embedding(actors, width, sparse=True)
-        self.class_embedding = nn.Parameter(
-            LATENT_SPREAD * torch.randn(len(CLASSES), *shape, generator=generator)
+        self.latent_log_variance = nn.Embedding(actors, width, sparse=True) if settings.decoder else None
+        self.class_embedding = (
+            nn.Parameter(LATENT_SPREAD * torch.randn(len(CLASSES), *shape, generator=generator))
+            if settings.decoder
+            else None
         )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-            self.decoder = AssetDecoder(
-                settings.latent_channels,
-                settings.decoder_channels,
-                settings.plane_channels,
-                settings.decoder_groups,
-                settings.decoder_patch_channels,
+            self.decoder = (
+                AssetDecoder(
+                    settings.latent_channels,
+                    settings.decoder_channels,
+                    settings.plane_channels,
+                    settings.decoder_groups,
+                    settings.decoder_patch_channels,
+                )
+                if settings.decoder
+                else None
             )
             self.field = FeatureField(3 * settings.plane_channels, settings.field_hidden, settings.features)
             self.background_field = FeatureField(
@@ -95,7 +109,8 @@ class AssetModel(nn.Module):
         )
         with torch.no_grad():
             self.latent_mean.weight.copy_(LATENT_SPREAD * torch.randn(actors, width, generator=generator))
-            self.latent_log_variance.weight.fill_(LOG_VARIANCE_START)
+            if self.latent_log_variance is not None:
+                self.latent_log_variance.weight.fill_(LOG_VARIANCE_START)
         self.register_buffer("sizes", sizes.float())
         self.register_buffer("class_index", class_index.long())
         # Half precision is off by 0.05 % at most, little beside the radius of a cell, and every actor has a grid.
@@ -107,9 +122,16 @@ class AssetModel(nn.Module):
         """Image pixels along one side of a feature pixel."""
         return 2**self.settings.rgb_upsamplings
 
+    def codes(self) -> list[Tensor]:
+        """The parameters with a row an actor: means and log variances of the latent codes."""
+        embeddings = (self.latent_mean, self.latent_log_variance)
+        return [embedding.weight for embedding in embeddings if embedding is not None]
+
     def latents(self, actors: Int[Tensor, " n"], generator: torch.Generator | None = None) -> Latents:
         """Codes of some actors: drawn with the reparameterisation mu + sigma eps, or the means without generator."""
         mean = self.latent_mean(actors).reshape(-1, *self.latent_shape)
+        if self.latent_log_variance is None:
+            return Latents(mean, mean, None)
         log_variance = self.latent_log_variance(actors).reshape(-1, *self.latent_shape)
         if generator is None:
             return Latents(mean, mean, log_variance)
@@ -120,6 +142,8 @@ class AssetModel(nn.Module):
         self, actors: Int[Tensor, " n"], code: Float[Tensor, "n c h w"]
     ) -> Float[Tensor, "n 3 channels height width"]:
         """Triplanes of some actors from their codes and their classes' embeddings."""
+        if self.decoder is None or self.class_embedding is None:
+            return code.reshape(len(code), 3, self.settings.plane_channels, *code.shape[-2:])
         return self.decoder(code, self.class_embedding[self.class_index[actors]])
 
     def coarse_actors(self) -> CoarseActors:

@@ -18,6 +18,10 @@ class _Settings(BaseModel):
 class ModelSettings(_Settings):
     """Sizes of latents, decoder, fields and image network."""
 
+    decoder: bool = Field(
+        default=True,
+        description="whether planes are decoded from latent codes; else every actor's planes are learned themselves",
+    )
     latent_size: PositiveInt = 8
     latent_channels: PositiveInt = 32
     decoder_channels: tuple[PositiveInt, ...] = (64, 48, 32, 16)

@@ -109,8 +109,8 @@ class Trainer:
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
-        codes = [model.latent_mean.weight, model.latent_log_variance.weight]
-        self.sparse = torch.optim.SparseAdam([{"params": codes, "lr": rates.latent}], betas=(0.9, 0.99))
+        codes = {"params": model.codes(), "lr": rates.latent if model.decoder else rates.background}
+        self.sparse = torch.optim.SparseAdam([codes], betas=(0.9, 0.99))
         weights = settings.weights
         self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
         self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
@@ -198,9 +198,10 @@ class Trainer:
         image = self._image(rendered.feature[:patch_rays], batch.side, batch.side)
         losses = {
             "rgb": rgb_loss(image, batch.pixels),
-            "kl": kl_loss(latents.mean, latents.log_variance),
             "total_variation": total_variation(decoded),
         }
+        if latents.log_variance is not None:
+            losses["kl"] = kl_loss(latents.mean, latents.log_variance)
         if len(batch.lidar_distance):
             losses["lidar"] = lidar_loss(rendered.distance[lidar], batch.lidar_distance, settings.lidar_trim)
             losses["carving"] = rendered.in_free_space[lidar].mean()
