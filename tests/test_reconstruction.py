@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-import yaml
 from tiny_log import CAR_SIZE, MOVING, PARKED, WALKER
 from tiny_reconstruction import SETTINGS, STRIDE, Prepared, changed
 
@@ -22,11 +21,9 @@ from genassets.reconstruction.library import load_library, make_library, save_li
 from genassets.reconstruction.losses import kl_loss, lidar_loss, total_variation
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.scene_renderer import SceneRenderer
-from genassets.reconstruction.settings import ReconstructionSettings
-from genassets.reconstruction.training import Trainer, build_model, train
+from genassets.reconstruction.training import Trainer, train
 from genassets.reconstruction.training_data import draw_batch
 
-PAPER_PROFILE = Path(__file__).parents[1] / "data_specs" / "profiles" / "paper.yaml"
 LEARNING_STEPS = 60
 
 
@@ -268,31 +265,6 @@ def test_the_surface_of_an_actor_closes_inside_its_label(renderer: SceneRenderer
     assert all(axis[0] and axis[-1] and not axis[16] for axis in axes)
     assert grid[beyond].min() > -1e-6  # a value may lie on the face itself, to float32's rounding
     assert grid[16, 16, 16] < 0
-
-
-def test_the_paper_profile_is_the_papers_model() -> None:
-    """Supplement, "Scene Representation Model" to "Training Details"."""
-    document = yaml.safe_load(PAPER_PROFILE.read_text(encoding="utf-8"))
-    settings = ReconstructionSettings.model_validate(document["reconstruct"])
-    car = pd.DataFrame({"actor_class": ["Car"], "size_l": [4.5], "size_w": [1.9], "size_h": [1.6]})
-    model = build_model(car, ["log"], settings, seed=0)
-    assert model.latent_shape == (32, 8, 8)
-    assert model.class_embedding.shape == (8, 32, 8, 8)
-    assert model.stride == 4
-    with torch.no_grad():
-        index = torch.tensor([0])
-        assert model.decode(index, model.latents(index).code).shape == (1, 3, 12, 128, 128)
-        assert model.rgb(torch.zeros(1, 32, 4, 4)).shape == (1, 3, 16, 16)
-    assert model.backgrounds[0].planes.shape == (1, 3, 12, 256, 256)
-    assert len(model.rgb.blocks) == 6
-    kernels = {tuple(p.shape) for name, p in model.rgb.blocks.named_parameters() if name.endswith("weight")}
-    assert kernels == {(32, 32, 5, 5)}
-    rates, weights, rendering = settings.rates, settings.weights, settings.rendering
-    assert (rates.latent, rates.decoder, rates.field, rates.rgb) == (0.05, 1e-4, 1e-3, 1e-3)
-    assert (weights.rgb, weights.lidar, weights.kl) == (1.0, 0.01, 1e-5)
-    assert (rendering.actor_step, rendering.background_step, rendering.sky_samples) == (0.05, 0.30, 8)
-    assert rendering.occupancy_cell == 0.5
-    assert settings.image_scale == 1.0
 
 
 @pytest.mark.parametrize("threads", [1, 2])
