@@ -94,12 +94,18 @@ def test_footprints_are_where_a_plain_intersection_says() -> None:
 
 @pytest.mark.parametrize(
     ("origin", "direction"),
-    [((0, 0, 3), (0, 0, 1)), ((0, 0, -3), (0, 0, 1)), ((-9, 0, 0.5), (1, 0, 0)), ((0, 0, -1), (0, 0, -1))],
+    [
+        ((0, 0, 3), (0, 0, 1)),
+        ((0, 0, -3), (0, 0, 1)),
+        ((-9, 0, 0.5), (1, 0, 0)),
+        ((-9, 0, 0.5), (1, 0, -1e-320)),
+        ((0, 0, -1), (0, 0, -1)),
+    ],
 )
 def test_rays_that_see_no_ground_have_no_footprint(
     origin: tuple[float, ...], direction: tuple[float, ...]
 ) -> None:
-    """Upwards, from below, along the ground, and away from it: no division by zero, no place behind the camera."""
+    """Upwards, from below, along the ground or all but, away from it: no division by zero, none behind the camera."""
     rays = cast_rays(
         np.array([origin], float),
         np.array([direction], float),

@@ -124,8 +124,11 @@ def _on_the_ground(
     """Rays (N, 3) of a box frame that meet its grown footprint: their numbers, places (n, 2), distances, descents."""
     falling = np.flatnonzero((direction[:, 2] < 0) & (origin[:, 2] > -size[2] / 2))
     descent = -direction[falling, 2]
-    distance = (origin[falling, 2] + size[2] / 2) / descent
-    place = origin[falling, :2] + distance[:, None] * direction[falling, :2]
+    with np.errstate(
+        over="ignore", invalid="ignore"
+    ):  # all but parallel, a ray meets the plane at infinity, or nowhere
+        distance = (origin[falling, 2] + size[2] / 2) / descent
+        place = origin[falling, :2] + distance[:, None] * direction[falling, :2]
     inside = np.all(np.abs(place) < size[:2] / 2 + FOOTPRINT_MARGIN, axis=1)
     return falling[inside], place[inside], distance[inside], descent[inside]
 
