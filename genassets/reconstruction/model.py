@@ -101,6 +101,10 @@ class AssetModel(nn.Module):
         """Image pixels along one side of a feature pixel."""
         return 2**self.settings.rgb_upsamplings
 
+    def codes(self) -> list[Tensor]:
+        """The parameters with a row an actor: means and log variances of the latent codes."""
+        return [self.latent_mean.weight, self.latent_log_variance.weight]
+
     def latents(self, actors: Int[Tensor, " n"], generator: torch.Generator | None = None) -> Latents:
         """Codes of some actors: drawn with the reparameterisation mu + sigma eps, or the means without generator."""
         mean = self.latent_mean(actors).reshape(-1, *self.latent_shape)
@@ -123,6 +127,14 @@ class AssetModel(nn.Module):
     def refresh_coarse_distance(self, actor: int, fields: ActorFields) -> None:
         """Take an actor's coarse distance from its decoded planes."""
         self.coarse_distance[actor] = coarse_distance(fields, actor, self.settings.coarse_resolution)
+
+    @torch.no_grad()
+    def refresh_coarse_distances(self) -> None:
+        """Coarse distance of every actor from its mean code, as the finished model uses it."""
+        for actors in torch.arange(len(self.sizes)).split(16):
+            fields = self.actor_fields(actors, self.decode(actors, self.latents(actors).code))
+            for actor in actors.tolist():
+                self.refresh_coarse_distance(actor, fields)
 
     def actor_fields(
         self, actors: Int[Tensor, " n"], planes: Float[Tensor, "n 3 channels height width"]
