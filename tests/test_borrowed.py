@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import shutil
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +22,8 @@ from genassets.pipeline.preflight import check_borrowed_outputs
 from genassets.pipeline.run_record import RunRecord
 from genassets.stages.stage import Borrowed, Inputs, Metric, Stage, StageContext
 from tests.toy_pipeline import NUMBERS, REPORT, SPEC, TOTAL, ReportConfig, run_toy, start_record, toy_workflow
+
+REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 def run_report(inputs: Inputs, config: ReportConfig, out: Path, context: StageContext) -> list[Metric]:
@@ -125,3 +130,17 @@ def test_the_same_workflow_stays_with_what_it_found(tmp_path: Path) -> None:
     run_toy(tmp_path, ["numbers.value=5"])
     assert workflow.borrowed(step) == before
     assert RunRecord.load(sorted((tmp_path / "runs").iterdir())[-1]).status == "completed"
+
+
+@pytest.mark.parametrize("experiment", ["city_adapted", "pandaset_002_adapted"])
+def test_the_command_ends_before_it_makes_anything(tmp_path: Path, experiment: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "from genassets.cli.app import main; main()", "run", experiment],
+        cwd=REPOSITORY,
+        env={**os.environ, "GENASSETS_HOME": str(tmp_path), "PANDASET_ROOT": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("genassets: reconstruct.adapt.library is 'demo'")
+    assert not (tmp_path / "runs").exists()
