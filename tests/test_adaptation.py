@@ -187,7 +187,7 @@ def test_a_gaussian_prior_and_the_kl_balance_where_the_closed_form_says(
 
     settings = changed(
         ADAPTED,
-        steps=200,
+        steps=400,
         views=1,
         patches=4,
         patch_size=2,
@@ -203,7 +203,7 @@ def test_a_gaussian_prior_and_the_kl_balance_where_the_closed_form_says(
         learned |= set(trainer.advance().actors.tolist())
     assert learned == set(range(len(library.assets)))
     expected = torch.full_like(model.latent_mean.weight, w * m / (w + k))
-    torch.testing.assert_close(model.latent_mean.weight.detach(), expected, atol=0.03, rtol=0)
+    torch.testing.assert_close(model.latent_mean.weight.detach(), expected, atol=0.02, rtol=0)
 
 
 def test_the_pull_is_added_to_the_gradient_of_the_codes_that_a_step_learns(
