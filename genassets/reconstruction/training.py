@@ -116,8 +116,8 @@ class Trainer:
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
-        codes = [model.latent_mean.weight, model.latent_log_variance.weight]
-        self.sparse = torch.optim.SparseAdam([{"params": codes, "lr": rates.latent}], betas=(0.9, 0.99))
+        codes = [{"params": model.codes(), "lr": rates.latent}]
+        self.sparse = torch.optim.SparseAdam(codes, betas=(0.9, 0.99))
         weights = settings.weights
         self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
         self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
