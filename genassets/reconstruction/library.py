@@ -1,6 +1,7 @@
 """The asset library on disk: what a reconstruction leaves for evaluation, generation and augmentation.
 
-assets.parquet       a row an actor: log, actor_id, actor_class, size_l, size_w, size_h, observations
+assets.parquet       a row an actor: log, actor_id, actor_class, size_l, size_w, size_h, observations, and
+                     colour_l, colour_a, colour_b, which libraries of earlier versions lack
 latents.safetensors  mean and log_variance (actors, channels, size, size), in the order of the table
 weights.safetensors  decoder, fields, image network, class embeddings, backgrounds, occupancy
 config.json          settings, logs with their scene frames, occupancy grids' places
