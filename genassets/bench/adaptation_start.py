@@ -13,6 +13,7 @@ from genassets.bench.benchmark import Benchmark, Row
 
 if TYPE_CHECKING:
     import numpy as np
+    import pandas as pd
     from numpy.typing import NDArray
 
     from genassets.driving.log import Log
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from genassets.reconstruction.library import AssetLibrary
     from genassets.reconstruction.settings import ReconstructionSettings
     from genassets.reconstruction.training import Trainer
+    from genassets.reconstruction.training_data import TrainingLog
 
 CAMERA = "front_camera"
 STARTS: tuple[Start, ...] = ("random", "class_mean", "nearest")
@@ -66,7 +68,8 @@ def run(say: Callable[[str], None]) -> Sequence[Row]:
     settings = ReconstructionSettings(
         image_scale=1.0, model=ModelSettings(decoder_groups=2, rgb_upsamplings=0, sharpness=30)
     )
-    spec = CitySpec(frames=12, vehicles=24, pedestrians=3)
+    # Few classes, so that actors of the one log have neighbours in the other.
+    spec = CitySpec(frames=12, vehicles=40, pedestrians=0, classes=("Car", "Truck"))
     with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:
         logs = []
         for number, name in enumerate(("known", "unseen")):
@@ -85,9 +88,9 @@ def measure(
 ) -> Sequence[Row]:
     """One row a start, and one for learning the log alone without a library.
 
-    Every second frame of the front camera trains, of both logs. PSNR is the mean over actors and held-out frames of
-    that over the true mask's pixels. Starts take turns between the looks at them, which are not counted; what finding
-    the codes takes is.
+    Every second frame of all cameras trains, of both logs; the front camera's others test. PSNR is the mean over actors
+    and held-out frames of that over the true mask's pixels. Starts take turns between the looks at them, which are not
+    counted; what finding the codes takes is.
     """
     library = _train_library(known, settings.model_copy(update={"steps": library_steps}), say)
     contenders = _contenders(library, unseen, settings.model_copy(update={"steps": adaptation_steps}))
@@ -135,23 +138,31 @@ def _is_training(frame: int) -> bool:
     return frame % 2 == 0
 
 
+def _prepared(log_root: Path, settings: ReconstructionSettings) -> tuple[pd.DataFrame, TrainingLog]:
+    """The actors of a log, with their colours, and its training data."""
+    from genassets.driving import CAMERA_NAMES, open_log
+    from genassets.reconstruction.actor_colour import with_colours
+    from genassets.reconstruction.training_data import prepare_training
+
+    stride = 2**settings.model.rgb_upsamplings
+    assets, data = prepare_training([open_log(log_root)], CAMERA_NAMES, _is_training, settings, stride)
+    return with_colours(assets, data), data[0]
+
+
 def _train_library(
     log_root: Path, settings: ReconstructionSettings, say: Callable[[str], None]
 ) -> AssetLibrary:
     """What reconstruct makes of one log."""
-    from genassets.driving import open_log
-    from genassets.reconstruction.actor_colour import with_colours
     from genassets.reconstruction.library import make_library
     from genassets.reconstruction.training import build_model, train
-    from genassets.reconstruction.training_data import prepare_training
 
-    log = open_log(log_root)
-    stride = 2**settings.model.rgb_upsamplings
-    assets, data = prepare_training([log], (CAMERA,), _is_training, settings, stride)
-    model = build_model(assets, [log.name], settings, SEED)
+    assets, data = _prepared(log_root, settings)
+    model = build_model(assets, [log_root.name], settings, SEED)
     with tempfile.TemporaryDirectory(prefix="genassets-bench-") as work:
-        train(model, data, settings, SEED, Path(work), lambda _, __, text: say(f"library: {text}"), _no_curve)
-    return make_library(with_colours(assets, data), model, settings, [data[0].scene], [data[0].occupancy])
+        train(
+            model, [data], settings, SEED, Path(work), lambda _, __, text: say(f"library: {text}"), _no_curve
+        )
+    return make_library(assets, model, settings, [data.scene], [data.occupancy])
 
 
 def _no_curve(name: str, step: int, value: float) -> None:
@@ -159,27 +170,21 @@ def _no_curve(name: str, step: int, value: float) -> None:
 
 
 def _contenders(library: AssetLibrary, unseen: Path, settings: ReconstructionSettings) -> list[Contender]:
-    from genassets.driving import open_log
-    from genassets.reconstruction.actor_colour import with_colours
     from genassets.reconstruction.adaptation import adapted_model
     from genassets.reconstruction.library import make_library
     from genassets.reconstruction.training import Trainer, build_model
-    from genassets.reconstruction.training_data import prepare_training
 
-    log = open_log(unseen)
-    stride = 2**settings.model.rgb_upsamplings
-    assets, data = prepare_training([log], (CAMERA,), _is_training, settings, stride)
-    assets = with_colours(assets, data)
+    assets, data = _prepared(unseen, settings)
     found = []
     for start in (*STARTS, None):
         begun = time.perf_counter()
         if start is None:
-            model = build_model(assets, [log.name], settings, SEED)
+            model = build_model(assets, [unseen.name], settings, SEED)
         else:
-            model = adapted_model(library, assets, [log.name], settings, start, SEED)
+            model = adapted_model(library, assets, [unseen.name], settings, start, SEED)
         seconds = time.perf_counter() - begun
-        made = make_library(assets, model, settings, [data[0].scene], [data[0].occupancy])
-        found.append(Contender(start or FROM_SCRATCH, Trainer(model, data, settings, SEED), made, seconds))
+        made = make_library(assets, model, settings, [data.scene], [data.occupancy])
+        found.append(Contender(start or FROM_SCRATCH, Trainer(model, [data], settings, SEED), made, seconds))
     return found
 
 
