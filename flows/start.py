@@ -15,7 +15,7 @@ from genassets.cli.launch import RunRequest, load_workflow
 from genassets.errors import EnvironmentProblem
 from genassets.pipeline.atomic_write import write_text
 from genassets.pipeline.home import Home
-from genassets.pipeline.preflight import check_pretrained_files
+from genassets.pipeline.preflight import check_needs
 from genassets.pipeline.run_record import RunRecord, new_run_directory
 
 
@@ -49,7 +49,7 @@ def run_flow(request: RunRequest) -> RunRecord:
     """
     workflow = load_workflow(request)
     workflow.pin_code()
-    check_pretrained_files(workflow)
+    check_needs(workflow)
     directory = new_run_directory(workflow.home.runs, workflow.experiment.header.name)
     prepare_environment(workflow.home)
     print(

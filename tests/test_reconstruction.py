@@ -57,7 +57,7 @@ def learned(prepared: Prepared) -> tuple[Trainer, float]:
     before = rgb_error(trainer)
     for _ in range(LEARNING_STEPS):
         trainer.advance()
-    trainer.refresh_coarse_distance()
+    trainer.model.refresh_coarse_distances()
     return trainer, before
 
 

@@ -17,7 +17,7 @@ from genassets.pipeline.catalog import CATALOG, configs
 from genassets.pipeline.executor import Engine, RunListener, execute, run_inline
 from genassets.pipeline.home import Home
 from genassets.pipeline.plan import Selection, Workflow
-from genassets.pipeline.preflight import check_pretrained_files
+from genassets.pipeline.preflight import check_needs
 from genassets.pipeline.run_record import (
     SPEC_FILE,
     RunRecord,
@@ -89,7 +89,7 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         run_id: name of a directory already made for it below runs/; a new one by default.
     """
     workflow = load_workflow(request)
-    check_pretrained_files(workflow)
+    check_needs(workflow)
     name = workflow.experiment.header.name
     runs = workflow.home.runs
     directory = new_run_directory(runs, name) if run_id is None else runs / run_id

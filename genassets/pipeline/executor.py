@@ -103,7 +103,7 @@ def perform(
             }
             config = workflow.experiment.config(name, step.shard)
             started = time.monotonic()
-            metrics = step.stage.run(Inputs(paths), config, out, context)
+            metrics = step.stage.run(Inputs(paths, workflow.borrowed(step)), config, out, context)
             seconds = time.monotonic() - started
             try:
                 workflow.check_code(step.stage)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from genassets.errors import CodeChanged, SpecError
+from genassets.pipeline.borrowed import find_output, output_digest
 from genassets.pipeline.catalog import dependents, wanted_stages
 from genassets.pipeline.code_digest import code_trees
 from genassets.pipeline.file_digests import FileMemory, sha256_of
@@ -17,7 +18,7 @@ from genassets.pipeline.source_digest import source_digest
 from genassets.pipeline.store import Store, StoredObject
 from genassets.specs.experiment import Experiment
 from genassets.specs.log_source import PandasetSource
-from genassets.stages.stage import Stage
+from genassets.stages.stage import Borrowed, Stage
 
 CODE_MEMORY = "code.json"
 SOURCE_ROOT = Path(__file__).parents[2]
@@ -81,6 +82,7 @@ class Workflow:
         self.selection = selection
         self.stages = self._selected(tuple(catalog))
         self._logs: dict[str, str] = {}
+        self._borrowed: dict[Borrowed, tuple[Path, str]] = {}
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
         names = [stage.name for stage in catalog]
@@ -178,6 +180,8 @@ class Workflow:
         """Digests of what a step reads from outside the store: its log's files, files that its config names."""
         config = self.experiment.config(step.stage.name, step.shard)
         sources = dict(step.stage.reads(config))
+        for borrowed in step.stage.borrows(config):
+            sources[f"{borrowed.stage} of {borrowed.where}"] = self._borrow(borrowed)[1]
         for name in type(config).model_fields:
             value = getattr(config, name)
             if isinstance(value, PandasetSource):
@@ -188,6 +192,28 @@ class Workflow:
                 with FileMemory(self.home.cache / "sources" / "files.json") as memory:
                     sources[name] = memory.of(value.resolve(), sha256_of)
         return sources
+
+    def borrowed(self, step: Step) -> dict[str, Path]:
+        """Directories of the outputs of other runs that a step reads, by stage.
+
+        Raises:
+            SpecError: the spec names a directory, run or experiment that has no such output.
+        """
+        config = self.experiment.config(step.stage.name, step.shard)
+        return {borrowed.stage: self._borrow(borrowed)[0] for borrowed in step.stage.borrows(config)}
+
+    def _borrow(self, borrowed: Borrowed) -> tuple[Path, str]:
+        """Directory and content digest of another run's output: the same as long as this workflow lives."""
+        if borrowed not in self._borrowed:
+            if borrowed.where == self.experiment.header.name:
+                raise SpecError(
+                    f"{borrowed.setting} is {borrowed.where!r}, this experiment itself, so that every run would build "
+                    "on the one before; name another experiment, a run or a directory"
+                )
+            path = find_output(borrowed, self.home.runs)
+            with FileMemory(self.home.cache / "sources" / "borrowed.json") as memory:
+                self._borrowed[borrowed] = path, output_digest(path, memory)
+        return self._borrowed[borrowed]
 
     def _log_digest(self, source: PandasetSource) -> str:
         if source.name not in self._logs:

@@ -1,10 +1,30 @@
-"""What a run needs from the machine, checked before any of its work."""
+"""What a run needs from the machine and from other runs, checked before any of its work."""
 
 from __future__ import annotations
 
 from genassets import weights
 from genassets.errors import WeightsError
 from genassets.pipeline.plan import Workflow, make_plan
+
+
+def check_needs(workflow: Workflow) -> None:
+    """Check outputs of other runs and pretrained files.
+
+    Raises:
+        SpecError, WeightsError: something is missing.
+    """
+    check_borrowed_outputs(workflow)
+    check_pretrained_files(workflow)
+
+
+def check_borrowed_outputs(workflow: Workflow) -> None:
+    """Find every output of another run that a stage reads.
+
+    Raises:
+        SpecError: one is not there.
+    """
+    for step in workflow.steps():
+        workflow.borrowed(step)
 
 
 def check_pretrained_files(workflow: Workflow) -> None:

@@ -154,6 +154,14 @@ class AssetModel(nn.Module):
         """Take an actor's coarse distance from its decoded planes."""
         self.coarse_distance[actor] = coarse_distance(fields, actor, self.settings.coarse_resolution)
 
+    @torch.no_grad()
+    def refresh_coarse_distances(self) -> None:
+        """Coarse distance of every actor from its mean code, as the finished model uses it."""
+        for actors in torch.arange(len(self.sizes)).split(16):
+            fields = self.actor_fields(actors, self.decode(actors, self.latents(actors).code))
+            for actor in actors.tolist():
+                self.refresh_coarse_distance(actor, fields)
+
     def actor_fields(
         self, actors: Int[Tensor, " n"], planes: Float[Tensor, "n 3 channels height width"]
     ) -> ActorFields:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -169,3 +169,17 @@ class ReconstructionSettings(_Settings):
     rendering: RenderingSettings = RenderingSettings()
     rates: LearningRates = LearningRates()
     weights: LossWeights = LossWeights()
+
+
+class AdaptationSettings(_Settings):
+    """Learning a log's codes and background for a library that is there already, and nothing else."""
+
+    library: Annotated[str, Field(min_length=1)] = Field(
+        description="the asset library: a directory, the id of a run, or the name of an experiment, whose newest "
+        "run that made one is taken"
+    )
+    start: Literal["random", "class_mean", "nearest"] = Field(
+        default="nearest",
+        description="code that an actor begins with: a random one, the mean of the library's actors of its class, or "
+        "that of the library's actor of its class that is nearest in size and colour",
+    )

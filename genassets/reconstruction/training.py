@@ -24,6 +24,7 @@ from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
 from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
 from genassets.reconstruction.adversary import Adversary
+from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.lidar_surface import draw_surface_samples
 from genassets.reconstruction.losses import (
     generator_loss,
@@ -96,13 +97,19 @@ def render_settings(settings: RenderingSettings) -> RenderSettings:
 class Trainer:
     """Model, optimisers and step counter; everything random in a step comes from (seed, step).
 
-    That makes a run that was killed and resumed from a checkpoint equal to one that was not.
+    That makes a run that was killed and resumed from a checkpoint equal to one that was not. Parameters that ask for
+    no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns.
     """
 
     def __init__(
-        self, model: AssetModel, data: Sequence[TrainingLog], settings: ReconstructionSettings, seed: int
+        self,
+        model: AssetModel,
+        data: Sequence[TrainingLog],
+        settings: ReconstructionSettings,
+        seed: int,
+        pull: LatentPull | None = None,
     ):
-        self.model, self.data, self.settings, self.seed = model, data, settings, seed
+        self.model, self.data, self.settings, self.seed, self.pull = model, data, settings, seed, pull
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
         self.planes = RememberedPlanes()  # what a step that only looks past an actor uses
@@ -114,7 +121,7 @@ class Trainer:
         weights = settings.weights
         self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
         self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
-        self._parameters = list(model.parameters())
+        self._parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
         self._workers = Workers(settings.views)
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
         self.symmetric = torch.tensor([CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()])
@@ -133,14 +140,17 @@ class Trainer:
             self._parameters, zip(*(share.gradients for share in shares), strict=True), strict=True
         ):
             parameter.grad = _sum(parts)
-        gradients = _gradients(self.model)
         result = _joined([share.result for share in shares])
+        pulls = self._pull(result.actors)
+        gradients = _gradients(self.model)
         if not torch.isfinite(get_total_norm(value for values in gradients.values() for value in values)):
             norms = {part: get_total_norm(values).item() for part, values in gradients.items()}
             bad = ", ".join(f"{part} ({norm})" for part, norm in norms.items() if not math.isfinite(norm))
             why = f"the gradient's norm is not finite in {bad or 'all parts together'}"
             raise self._stopped(why, [share.log for share in shares], result)
         self._remember(shares)
+        if self.pull is not None:
+            self.pull.keep(result.actors, pulls)
         self._set_rates()
         self.dense.step()
         self.sparse.step()
@@ -163,6 +173,19 @@ class Trainer:
         total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
         gradients = torch.autograd.grad(total / self.settings.views, self._parameters, allow_unused=True)
         return _Share(log, result, fields, gradients)
+
+    def _pull(self, actors: Tensor) -> Tensor:
+        """Add the prior's pull to the gradient of these actors' mean codes; returns the prior's gradients."""
+        if self.pull is None:
+            return torch.zeros(0)
+        rng = np.random.default_rng([self.seed, self.step, self.settings.views])  # views have those before
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        gradients = self.pull.gradients(actors, self.model.latents(actors).mean.detach(), generator)
+        weight = self.model.latent_mean.weight
+        share = gradients.flatten(1) * (self.pull.weight / len(actors))
+        pulled = torch.sparse_coo_tensor(actors[None], share, weight.shape, check_invariants=True)
+        weight.grad = _sum([weight.grad, pulled])
+        return gradients
 
     def _stopped(self, why: str, logs: list[int], result: StepResult) -> StageError:
         names = ", ".join(dict.fromkeys(self.data[log].scene.log_name for log in logs))
@@ -287,17 +310,6 @@ class Trainer:
             for group, rate in zip(optimiser.param_groups, rates, strict=True):
                 group["lr"] = rate * share
 
-    @torch.no_grad()
-    def refresh_coarse_distance(self) -> None:
-        """Coarse distance of every actor from its mean code, as the finished model uses it."""
-        for start in range(0, len(self.model.sizes), 16):
-            actors = torch.arange(start, min(start + 16, len(self.model.sizes)))
-            fields = self.model.actor_fields(
-                actors, self.model.decode(actors, self.model.latents(actors).code)
-            )
-            for actor in actors.tolist():
-                self.model.refresh_coarse_distance(actor, fields)
-
     def state(self) -> dict[str, Any]:
         """Everything that the next steps depend on."""
         return {
@@ -308,6 +320,7 @@ class Trainer:
             "dense": self.dense.state_dict(),
             "sparse": self.sparse.state_dict(),
             "adversary": None if self.adversary is None else self.adversary.state(),
+            "pull": None if self.pull is None else self.pull.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -320,6 +333,8 @@ class Trainer:
         self.sparse.load_state_dict(state["sparse"])
         if self.adversary is not None:
             self.adversary.restore(state["adversary"])
+        if self.pull is not None:
+            self.pull.restore(state["pull"])
 
 
 def parameter_groups(model: AssetModel, rates: LearningRates) -> list[dict[str, Any]]:
@@ -388,9 +403,10 @@ def train(
     work_dir: Path,
     progress: Progress,
     curve: Curve,
+    pull: LatentPull | None = None,
 ) -> None:
     """Train the model in place, from the checkpoint in work_dir where there is one."""
-    trainer = Trainer(model, data, settings, seed)
+    trainer = Trainer(model, data, settings, seed, pull)
     checkpoint = work_dir / "checkpoint.pt"
     if checkpoint.exists():
         try:
@@ -413,7 +429,7 @@ def train(
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
         if step % settings.checkpoint_every == 0 and step < settings.steps:
             save_checkpoint(trainer, checkpoint)
-    trainer.refresh_coarse_distance()
+    model.refresh_coarse_distances()
 
 
 def save_checkpoint(trainer: Trainer, path: Path) -> None:

@@ -46,13 +46,26 @@ class Metric:
 
 
 @dataclass(frozen=True)
+class Borrowed:
+    """The output of ``stage`` in another run. ``where`` is the value of ``setting`` (as for --set): a directory, a
+    run's id, or the name of an experiment, whose newest finished one is meant.
+    """
+
+    stage: str
+    setting: str
+    where: str
+
+
+@dataclass(frozen=True)
 class Inputs:
     """Directories of the finished stages that a stage needs.
 
     ``objects`` maps stage to shard to directory; a stage that is not sharded has the single shard "".
+    ``borrowed`` maps stage to the directory of its output in another run.
     """
 
     objects: Mapping[str, Mapping[str, Path]]
+    borrowed: Mapping[str, Path] = field(default_factory=dict)
 
     def one(self, stage: str) -> Path:
         """The directory of a stage with one output, or of this shard's own output of a sharded stage.
@@ -80,6 +93,11 @@ class Inputs:
 def _nothing(config: Any) -> Mapping[str, str]:
     """Of a stage that neither reads more than its inputs nor needs pretrained files."""
     return {}
+
+
+def _borrows_nothing(config: Any) -> tuple[Borrowed, ...]:
+    """Of a stage that reads this run's outputs alone."""
+    return ()
 
 
 def _ignore_progress(done: float, total: float, message: str) -> None:
@@ -129,6 +147,8 @@ class Stage:
             stages that read this one don't run again.
         reads: digests of what the result depends on besides inputs, config and code, by name: the
             pretrained files, say. Files and logs that the config names are digested anyway.
+        borrows: outputs of other runs that the stage reads with a config. Their content is part of the
+            fingerprint.
         pretrained: pretrained files without which the stage cannot run with a config, each with the
             setting (as for --set) that does without; a run checks them before its first stage.
         sharded: one output per log of the dataset instead of one over all.
@@ -145,4 +165,5 @@ class Stage:
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()
     reads: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
+    borrows: Callable[[Any], tuple[Borrowed, ...]] = field(default=_borrows_nothing)
     pretrained: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
