@@ -32,8 +32,8 @@ def table(
         raise SpecError("--markdown and --json contradict each other; give one of them")
     home = Home.from_environment()
     rows = []
-    for name in runs or [None]:
-        directories = [_find(home.runs, part) for part in (name.split("+") if name else [None])]
+    for name in runs or [""]:
+        directories = [_find(home.runs, part) for part in name.split("+")]
         label = RunRecord.load(directories[0]).experiment
         parts = [RunMetrics(path.name, read_metrics(path / METRICS_FILE)) for path in directories]
         rows.append((label, parts))
@@ -49,11 +49,13 @@ def table(
         typer.echo(markdown_table(lines) if markdown else text_table(lines))
 
 
-def _find(runs: Path, name: str | None) -> Path:
-    """Directory of the newest run of an experiment that has metrics, else of a run by id or its start."""
+def _find(runs: Path, name: str) -> Path:
+    """Directory of the newest run of an experiment that has metrics, else of a run by id or its start, the newest of
+    all for "".
+    """
     from genassets.pipeline.run_record import METRICS_FILE, RunRecord, find_run, list_runs
 
     for path in reversed(list_runs(runs) if name else []):
         if (path / METRICS_FILE).is_file() and RunRecord.load(path).experiment == name:
             return path
-    return find_run(runs, name)
+    return find_run(runs, name or None)
