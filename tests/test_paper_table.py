@@ -176,6 +176,7 @@ def test_the_report_shows_distances_turns_and_what_was_left_out() -> None:
         *(one for one in metrics() if one["setting"] in ("360", "shape")),
         row("360", "kid_x1000_error", 2.0, n=16),
         {**row("360", "psnr", 14.0, n=8), "class": "Car"},
+        row("360/unseen", "psnr", 13.0, n=50),
         row("360/seen", "psnr", 16.0, n=30),
         row("360", "psnr_gain", 3.0, n=40, who="model over mean_colour"),
         {**row("360/skipped", "too_small", 2, n=2), "method": "count of actors"},
@@ -190,4 +191,7 @@ def test_the_report_shows_distances_turns_and_what_was_left_out() -> None:
     distances = tables["Turned renders against source crops"]
     assert [cell.text for cell in distances.rows[0].cells] == ["151.23", "-1.50", "2.00", "16"]
     turns = tables["Turns beside the true ones"]
+    assert [line.labels for line in turns.rows] == [
+        ("360", "model"), ("360", "mean_colour"), ("360/seen", "model"), ("360/unseen", "model"),
+    ]  # fmt: skip
     assert not any(cell.best for line in turns.rows for cell in line.cells), "80 turns and 40 do not compete"

@@ -35,7 +35,7 @@ NAMES = {
     "kid_x1000": "KID x 1000",
     "kid_x1000_error": "its standard error",
 }
-GROUP_ORDER = ("moved", "same", "all", "no_crop", "unseen")
+GROUP_ORDER = ("moved", "same", "all", "no_crop", "360", "seen", "unseen")
 PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
 
 
