@@ -209,7 +209,8 @@ def test_a_log_that_lacks_something_is_reconstructed_and_evaluated(
 ) -> None:
     build(tmp_path / "logs" / "900")
     settings = (
-        "stages=[turntables]",
+        "stages=[evaluate_turns, turntables]",
+        "evaluate_turns.least_box_px=1",
         "reconstruct.steps=2",
         "reconstruct.patch_size=8",
         "turntables.resolution=32",

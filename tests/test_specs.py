@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
@@ -88,7 +89,7 @@ def test_malformed_yaml(text: str, message: str) -> None:
 
 def test_missing_file_lists_what_is_there(tmp_path: Path) -> None:
     with pytest.raises(
-        SpecError, match=r"known by name: city_adapted, demo, pandaset_002, pandaset_002_adapted"
+        SpecError, match=r"known by name: city_adapted, city_bench, .*, demo, pandaset_002, pandaset_002_adapted"
     ):
         load_experiment("demmo", configs(CATALOG))
     with pytest.raises(SpecError, match="no such file"):
@@ -201,3 +202,79 @@ def test_an_unknown_camera_names_the_nearest() -> None:
     assert "toy.yaml:13: split.camera is 'bakc_camera'" in message
     assert "did you mean 'back_camera'?" in message
     assert get_args(CameraName) == CAMERA_NAMES
+
+
+def experiments(folder: Path, **files: str) -> Path:
+    """A directory of spec files with some experiments; returns it."""
+    (folder / "experiments").mkdir()
+    for kind in ("datasets", "profiles"):
+        (folder / kind).mkdir()
+    (folder / "profiles" / "laptop.yaml").write_text("numbers: {threads: 4}\n")
+    for name, text in files.items():
+        (folder / "experiments" / f"{name}.yaml").write_text(text)
+    return folder
+
+
+def over_base(folder: Path, text: str, *overrides: str) -> Experiment:
+    return build_experiment(parse_document(text, "mine.yaml"), configs(TOYS), overrides, folder)
+
+
+def test_a_base_gives_what_the_experiment_does_not_say(tmp_path: Path) -> None:
+    base = SPEC + "  threads: 2\ntotal: {scale: 4.0}\ndescription: the whole thing\nsplit: {every: 3}\n"
+    folder = experiments(tmp_path, toy=base, between="base: toy\nname: between\ntotal: {scale: 8.0}\n")
+    mine = over_base(folder, "base: between\nname: mine\nnumbers: {value: 5}\n", "split.every=6")
+    assert (mine.header.name, mine.header.description) == ("mine", "")
+    numbers = mine.config("numbers", "one").model_dump()
+    assert (numbers["value"], numbers["threads"]) == (5, 2), "the base goes before its profile"
+    assert mine.config("total", None).model_dump()["scale"] == 8.0
+    assert mine.header.split.every == 6
+    assert [source.name for source in mine.sources] == ["one", "two"]
+    assert "base" not in mine.resolved()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: toyy\nname: mine\n", r"^mine\.yaml:1: base is 'toyy': .*known by name: loop, toy$"),
+        ("base: [toy]\nname: mine\n", r"^mine\.yaml:1: base is \['toy'\]; expected the name"),
+        (
+            "base: toy\nnumbers: {value: 5}\n",
+            r"^mine\.yaml: name is missing; an experiment with a base has its own",
+        ),
+        (
+            "base: loop\nname: mine\n",
+            r"loop\.yaml:1: base leads back to itself \(.*loop\.yaml -> .*loop\.yaml\)",
+        ),
+        ("base: toy\nname: mine\nnumbers: {valeu: 5}\n", r"^mine\.yaml:3: unknown key 'valeu' in numbers"),
+        ("bas: toy\nname: mine\n", r"^mine\.yaml:1: unknown key 'bas'; did you mean 'base'\?"),
+    ],
+)
+def test_mistakes_about_a_base_name_file_and_line(text: str, message: str, tmp_path: Path) -> None:
+    folder = experiments(tmp_path, toy=SPEC, loop="base: loop\nname: loop\n")
+    with pytest.raises(SpecError, match=message):
+        over_base(folder, text)
+
+
+def test_a_mistake_in_the_base_names_the_base(tmp_path: Path) -> None:
+    folder = experiments(tmp_path, toy=SPEC.replace("value: 3", "value: 300"))
+    with pytest.raises(SpecError, match=r"toy\.yaml:10: numbers\.value is 300; expected"):
+        over_base(folder, "base: toy\nname: mine\n")
+
+
+def test_ablations_differ_from_city_bench_in_what_they_are_named_after() -> None:
+    whole = load_experiment("city_bench", configs(CATALOG)).resolved()
+    for name, path, value in (
+        ("no_kl", ("reconstruct", "weights", "kl"), 0.0),
+        ("perceptual", ("reconstruct", "weights", "perceptual"), 0.1),
+    ):
+        ablation = load_experiment(f"city_bench_{name}", configs(CATALOG)).resolved()
+        assert dict(_differences(whole, ablation)).keys() == {("name",), ("description",), path}
+        assert dict(_differences(whole, ablation))[path] == value
+
+
+def _differences(first: Any, second: Any, at: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    if isinstance(first, dict) and isinstance(second, dict):
+        for key in {*first, *second}:
+            yield from _differences(first.get(key), second.get(key), (*at, key))
+    elif first != second:
+        yield at, second

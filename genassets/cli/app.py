@@ -28,6 +28,7 @@ from genassets.cli.run import run
 from genassets.cli.schema import schema
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
+from genassets.cli.table import table
 from genassets.cli.verify import verify
 from genassets.errors import EnvironmentProblem, GenAssetsError
 
@@ -71,6 +72,7 @@ app.command("status")(status)
 app.command("explain")(explain)
 app.command("resume")(resume)
 app.command("report")(report)
+app.command("table")(table)
 app.command("list")(list_runs)
 app.command("verify")(verify)
 app.command("schema")(schema)

@@ -24,6 +24,11 @@ class ImageScale:
     width: int
     height: int
 
+    @property
+    def area_ratio(self) -> float:
+        """Compared pixels a stored pixel."""
+        return self.width * self.height / (self.stored_width * self.stored_height)
+
     def bounds(self, stored: Bounds) -> Bounds:
         """Bounds in stored-image pixels as bounds in compared pixels."""
         x, y = self.width / self.stored_width, self.height / self.stored_height

@@ -111,8 +111,10 @@ class Comparison:
 
 
 @dataclass
-class _TrainingActor:
-    """What the baselines know of one actor."""
+class TrainingActor:
+    """What the baselines know of one actor: its masked training observations, the pixels around each with its bounds
+    in them (both as stored), and its mean colour.
+    """
 
     observations: list[Observation]
     crops: list[tuple[NDArray[np.uint8], Bounds]]
@@ -141,7 +143,7 @@ def evaluate_log(
     """
     wanted = {o.actor_id for o in held_out} & library
     by_image = _by_image(held_out)
-    known = _training_actors(log, [o for o in training if o.actor_id in wanted], renderer)
+    known = training_actors(log, [o for o in training if o.actor_id in wanted], renderer)
     views_of: dict[str, list[View]] = defaultdict(list)
     for view in views:
         views_of[view.actor_id].append(view)
@@ -183,17 +185,17 @@ def _by_image(observations: Sequence[Observation]) -> dict[tuple[str, int], list
     return images
 
 
-def _training_actors(
+def training_actors(
     log: Log, training: Sequence[Observation], renderer: ImageRenderer
-) -> dict[str, _TrainingActor]:
-    """Crops at stored size and mean colours at compared size, each image read once."""
-    actors: dict[str, _TrainingActor] = {}
+) -> dict[str, TrainingActor]:
+    """By actor id: crops at stored size and mean colours at compared size, each image read once."""
+    actors: dict[str, TrainingActor] = {}
     for (camera, frame), observations in _by_image(training).items():
         scale = image_scale(log, camera, renderer)
         stored = log.cameras[camera].image(frame)
         image = scale.image(stored)
         for observation in observations:
-            actor = actors.setdefault(observation.actor_id, _TrainingActor([], [], ColourMean.empty()))
+            actor = actors.setdefault(observation.actor_id, TrainingActor([], [], ColourMean.empty()))
             actor.observations.append(observation)
             actor.crops.append(_stored_crop(stored, observation.bounds))
             mask = scale.mask(observation.mask())
@@ -223,7 +225,7 @@ def _score(
     mask: NDArray[np.bool_],
     scale: ImageScale,
     views: Sequence[View],
-    actor: _TrainingActor | None,
+    actor: TrainingActor | None,
     renderer: ImageRenderer,
     lpips: Lpips | None,
     comparison: Comparison,

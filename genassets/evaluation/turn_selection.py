@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
+
+ActorKey = tuple[str, str]
+"""Log and actor id."""
 
 BEHIND_DEGREES = 60.0
 """A view is from behind when its azimuth lies within this angle of 180 degrees."""
@@ -49,7 +54,7 @@ def select_actors(
     model = actors[actors["predictor"] == "model"].sort_values(["psnr", "log", "actor_id"], ascending=False)
     ranked = list(zip(model["log"], model["actor_id"], strict=True))
     middle = max(0, (len(ranked) - count) // 2)
-    reasons: dict[tuple[str, str], list[str]] = {}
+    reasons: dict[ActorKey, list[str]] = {}
     for reason, chosen in (
         ("best", ranked[:count]),
         ("median", ranked[middle : middle + count]),
@@ -61,34 +66,47 @@ def select_actors(
     for name, group in observed.groupby("actor_class", sort=True):
         first = group.iloc[0]
         reasons.setdefault((first["log"], first["actor_id"]), []).append(f"most observed {name}")
-    azimuths: dict[tuple[str, str], tuple[float, ...]] = {}
-    for view in views[views["training"]].to_dict("records"):
-        key = (view["log"], view["actor_id"])
-        azimuths[key] = (*azimuths.get(key, ()), float(view["azimuth"]))
+    azimuths = seen_azimuths(views)
     for key in _never_from_behind(observed, azimuths)[:count]:
         reasons.setdefault(key, []).append("never seen from behind")
     asset_of = {(asset["log"], asset["actor_id"]): asset for asset in assets.to_dict("records")}
     psnr_of = dict(zip(ranked, model["psnr"].astype(float), strict=True))
-    turned = []
-    for key, why in reasons.items():
-        asset = asset_of[key]
-        turned.append(
-            TurnedActor(
-                log=key[0],
-                actor_id=key[1],
-                actor_class=str(asset["actor_class"]),
-                size=(float(asset["size_l"]), float(asset["size_w"]), float(asset["size_h"])),
-                reasons=tuple(why),
-                psnr=psnr_of.get(key),
-                seen_azimuths=azimuths.get(key, ()),
-            )
-        )
-    return turned
+    return [_turned(asset_of[key], tuple(why), psnr_of.get(key), azimuths) for key, why in reasons.items()]
 
 
-def _never_from_behind(
-    observed: pd.DataFrame, azimuths: dict[tuple[str, str], tuple[float, ...]]
-) -> list[tuple[str, str]]:
+def every_actor(assets: pd.DataFrame, views: pd.DataFrame) -> list[TurnedActor]:
+    """All actors of a library in its order; tables as for `select_actors`."""
+    azimuths = seen_azimuths(views)
+    return [_turned(asset, (), None, azimuths) for asset in assets.to_dict("records")]
+
+
+def seen_azimuths(views: pd.DataFrame) -> dict[ActorKey, tuple[float, ...]]:
+    """Azimuths of the training views of each actor, degrees, by log and actor id."""
+    azimuths: dict[ActorKey, tuple[float, ...]] = {}
+    for view in views[views["training"]].to_dict("records"):
+        key = (view["log"], view["actor_id"])
+        azimuths[key] = (*azimuths.get(key, ()), float(view["azimuth"]))
+    return azimuths
+
+
+def _turned(
+    asset: Mapping[Hashable, Any],
+    reasons: tuple[str, ...],
+    psnr: float | None,
+    azimuths: Mapping[ActorKey, tuple[float, ...]],
+) -> TurnedActor:
+    return TurnedActor(
+        log=str(asset["log"]),
+        actor_id=str(asset["actor_id"]),
+        actor_class=str(asset["actor_class"]),
+        size=(float(asset["size_l"]), float(asset["size_w"]), float(asset["size_h"])),
+        reasons=reasons,
+        psnr=psnr,
+        seen_azimuths=azimuths.get((asset["log"], asset["actor_id"]), ()),
+    )
+
+
+def _never_from_behind(observed: pd.DataFrame, azimuths: dict[ActorKey, tuple[float, ...]]) -> list[ActorKey]:
     keys = zip(observed["log"], observed["actor_id"], strict=True)
     return [
         key

@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from genassets.stages import (
     evaluate_reconstruction,
+    evaluate_turns,
     filter_occlusion,
     ingest,
     prepare_masks,
@@ -22,6 +23,7 @@ CATALOG: tuple[Stage, ...] = (
     filter_occlusion.STAGE,
     reconstruct.STAGE,
     evaluate_reconstruction.STAGE,
+    evaluate_turns.STAGE,
     turntables.STAGE,
 )
 

@@ -12,7 +12,9 @@ MetricRow = Mapping[str, Any]
 
 HIGHER_IS_BETTER = ("psnr", "ssim", "iou", "f_score", "watertight", "largest_part")
 LOWER_IS_BETTER = ("lpips", "chamfer", "extent_error", "fid", "kid")
-DECIMALS = {"psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3}
+DECIMALS = {
+    "psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3, "fid": 2, "kid": 2
+}  # fmt: skip
 ARROWS = {1: " \u2191", -1: " \u2193", 0: ""}
 """Behind a heading: whether more or less is better."""
 
@@ -29,8 +31,11 @@ NAMES = {
     "silhouette_iou": "silhouette IoU",
     "f_score": "F-score",
     "chamfer": "Chamfer, m",
+    "fid": "FID",
+    "kid_x1000": "KID x 1000",
+    "kid_x1000_error": "its standard error",
 }
-GROUP_ORDER = ("moved", "same", "all", "no_crop", "unseen")
+GROUP_ORDER = ("moved", "same", "all", "no_crop", "360", "seen", "unseen")
 PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
 
 
@@ -67,6 +72,8 @@ def stage_tables(stage: str, rows: Sequence[MetricRow]) -> list[MetricTable]:
     """The tables of one stage's metrics."""
     if stage == "evaluate_reconstruction":
         return _evaluation_tables(rows)
+    if stage == "evaluate_turns":
+        return _turn_tables(rows)
     overall = [row for row in rows if row["class"] == "all"]
     by_class = [row for row in rows if row["class"] != "all"]
     tables = [
@@ -112,6 +119,37 @@ def _evaluation_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
         metric_table(
             "By group, class and log", details, ("setting", "split", "class", "method"), folded=True
         ),
+    ]
+    return _without_repeated_notes(tables)
+
+
+DISTANCES = ("fid", "kid_x1000", "kid_x1000_error")
+
+
+def _turn_tables(rows: Sequence[MetricRow]) -> list[MetricTable]:
+    """The 360 degree evaluation: distances to the source crops, turns beside the truth, shapes, what was left out."""
+    distances = [row for row in rows if row["metric"] in DISTANCES]
+    counts = [row for row in rows if row["method"].startswith("count")]
+    shapes = [row for row in rows if row["setting"] == "shape"]
+    turns = [row for row in rows if row not in distances and row not in counts and row not in shapes]
+    gains = [row for row in turns if row["metric"].endswith("_gain")]
+    means = [row for row in turns if row not in gains]
+    tables = [
+        metric_table("Turned renders against source crops", distances, ("setting", "method"), compete=False),
+        metric_table(
+            "Turns beside the true ones: all, sides seen in training, sides not seen",
+            [row for row in means if row["class"] == "all"],
+            ("setting", "method"),
+        ),
+        metric_table(
+            "What the model gains over the baselines, where there are any",
+            [row for row in gains if row["class"] == "all"],
+            ("setting", "method"),
+            compete=False,
+        ),
+        metric_table("By class", [row for row in means if row["class"] != "all"], ("class", "method")),
+        metric_table("Shapes", shapes, ("setting", "method"), compete=False),
+        metric_table("Left out", counts, ("setting",), compete=False),
     ]
     return _without_repeated_notes(tables)
 
@@ -172,7 +210,7 @@ def metric_table(
     written = tuple(
         f"{measure_name(measure)}: {'; '.join(texts)}" for measure, texts in notes.items() if texts
     )
-    headings = tuple(f"{measure_name(measure)}{ARROWS[_direction(measure)]}" for measure in measures)
+    headings = tuple(f"{measure_name(measure)}{ARROWS[better(measure)]}" for measure in measures)
     return MetricTable(
         title, labels, (*headings, "n") if counted else headings, tuple(table_rows), written, folded
     )
@@ -199,23 +237,24 @@ def format_value(measure: str, value: float) -> str:
 def _best_values(
     lines: Mapping[tuple[str, ...], Mapping[str, MetricRow]], measures: Sequence[str]
 ) -> dict[tuple[tuple[str, ...], str], tuple[str, ...]]:
-    """Which line of each group is best in each measure; groups of one line have no best."""
+    """Which line of each group is best in each measure; lines over unequal numbers of samples do not compete."""
     groups: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
     for key in lines:
         groups.setdefault(key[:-1], []).append(key)
     best = {}
     for group, keys in groups.items():
         for measure in measures:
-            direction = _direction(measure)
+            direction = better(measure)
             competing = [key for key in keys if measure in lines[key]]
-            if direction and len(competing) > 1:
+            counts = {lines[key][measure]["n"] for key in competing}
+            if direction and len(competing) > 1 and len(counts) == 1:
                 best[group, measure] = max(
                     competing, key=lambda key: direction * float(lines[key][measure]["value"])
                 )
     return best
 
 
-def _direction(measure: str) -> int:
+def better(measure: str) -> int:
     """1 where more is better, -1 where less is, 0 where neither or unknown; a gain is better the larger it
     is.
     """

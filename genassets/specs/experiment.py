@@ -22,6 +22,12 @@ from genassets.specs.validation import unknown_key, validate
 SHARED_FIELDS = ("split", "source")
 
 
+BASE = "base"
+"""Key of an experiment that names the one whose keys it starts from."""
+OWN_FIELDS = ("name", "description")
+"""What an experiment does not take from its base: it would be mistaken for it."""
+
+
 class ExperimentHeader(BaseModel):
     """The keys of an experiment that are not stage sections."""
 
@@ -100,6 +106,7 @@ def build_experiment(
     Args:
         data_specs: directory with datasets and profiles; ``data_specs_root()`` by default.
     """
+    document = _over_its_base(document, data_specs)
     given = [override_document(override) for override in overrides]
     chosen = [override for override in given if _chooses_file(override)]
     top = document
@@ -117,13 +124,38 @@ def build_experiment(
     return _validated(top, configs)
 
 
+def _over_its_base(document: Document, data_specs: Path | None, above: tuple[Path, ...] = ()) -> Document:
+    """The document laid over the experiment that its key `base` names, and that over its own base.
+
+    Mappings merge key by key, anything else replaces; name and description are the document's own.
+    """
+    if BASE not in document.values:
+        return document
+    name, where = document.values[BASE], document.origin((BASE,))
+    if not isinstance(name, str):
+        raise SpecError(f"{where}: base is {name!r}; expected the name or the path of one experiment")
+    try:
+        path = _display(find_spec("experiments", name, data_specs))
+    except SpecError as error:
+        raise SpecError(f"{where}: base is {name!r}: {error}") from error
+    if path in above:
+        chain = " -> ".join(map(str, (*above[above.index(path) :], path)))
+        raise SpecError(f"{where}: base leads back to itself ({chain})")
+    if "name" not in document.values:
+        raise SpecError(f"{document.origin(())}: name is missing; an experiment with a base has its own")
+    base = _over_its_base(read_document(path), data_specs, (*above, path))
+    for key in OWN_FIELDS:
+        base = base.without(key)
+    return document.without(BASE).merged_over(base)
+
+
 def _chooses_file(override: Document) -> bool:
     """Whether an override names the dataset or the profile, which decides what other files are read."""
     return len(override.origins) == 1 and next(iter(override.values)) in ("dataset", "profile")
 
 
 def _validated(document: Document, configs: Mapping[str, type[BaseModel]]) -> Experiment:
-    known = [*ExperimentHeader.model_fields, *configs]
+    known = [*ExperimentHeader.model_fields, *configs, BASE]
     for key in document.values:
         if key not in known:
             raise unknown_key(key, known, document, (key,))

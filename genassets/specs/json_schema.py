@@ -9,7 +9,7 @@ from pydantic import BaseModel
 
 from genassets.city_spec import CitySpec
 from genassets.specs.dataset import PandasetDataset, SyntheticCityDataset
-from genassets.specs.experiment import SHARED_FIELDS, ExperimentHeader
+from genassets.specs.experiment import BASE, SHARED_FIELDS, ExperimentHeader
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -19,6 +19,11 @@ def experiment_schema(configs: Mapping[str, type[BaseModel]]) -> dict[str, Any]:
     definitions: dict[str, Any] = {}
     schema = _hoisted(ExperimentHeader, definitions)
     schema["properties"]["dataset"] = {"anyOf": [{"type": "string"}, {"type": "object"}]}
+    schema["properties"][BASE] = {
+        "type": "string",
+        "description": "Experiment, by name or path, whose keys hold where this one has none.",
+    }
+    schema["required"] = ["name"]  # the base may have the dataset
     for name, config in configs.items():
         section = _hoisted(config, definitions)
         for field in SHARED_FIELDS:

@@ -7,7 +7,6 @@ skipped.parquet and pictures. docs/evaluation.md says what each measure means.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -153,14 +152,8 @@ class _Seen:
 def _seen(path: Path, config: EvaluateReconstructionConfig) -> _Seen:
     """Read the views and observations of one log from the object table under `path`."""
     from genassets.curation.acceptance import REFERENCE_PIXELS
-    from genassets.curation.object_table import (
-        bounds_of,
-        box_from_camera_of,
-        mask_of,
-        read_object_table,
-    )
-    from genassets.evaluation.sparse_view import Observation, View
-    from genassets.evaluation.viewpoint import viewpoint_of
+    from genassets.curation.object_table import read_object_table
+    from genassets.evaluation.observation_row import observation_of, view_of
 
     rows = read_object_table(path / "objects.parquet")
     split = config.split
@@ -173,24 +166,10 @@ def _seen(path: Path, config: EvaluateReconstructionConfig) -> _Seen:
         trains = split.trains(camera, frame)
         if not trains and not split.tests(camera, frame):
             continue
-        view = View(
-            log=str(row.log),
-            frame=frame,
-            camera=camera,
-            actor_id=str(row.actor_id),
-            actor_class=str(row.actor_class),
-            viewpoint=viewpoint_of(box_from_camera_of(row)),
-        )
         if trains:
-            seen.views.append(view)
+            seen.views.append(view_of(row))
         if row.kept:
-            observation = Observation(
-                **vars(view),
-                bounds=bounds_of(row),
-                mask=partial(mask_of, row),
-                segmenter=str(row.segmenter),
-            )
-            (seen.training if trains else seen.held_out).append(observation)
+            (seen.training if trains else seen.held_out).append(observation_of(row))
     return seen
 
 

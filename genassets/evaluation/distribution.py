@@ -1,0 +1,160 @@
+"""How far two sets of images are apart, by their features: Fréchet and kernel distance (FID and KID).
+
+All in float64. No square root of a matrix is taken: of a product of covariances only the trace of its root is
+needed, and that is a sum of singular values, which are never negative and never complex.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+SUBSETS = 100
+LARGEST_SUBSET = 1000
+"""Images of each set in a subset of the kernel distance, at most (Bińkowski et al. 2018)."""
+ROUNDING = 1e-8
+"""A covariance may be off symmetric, or have a negative eigenvalue, by this part of its largest one."""
+
+
+def frechet_distance(mu1: ArrayLike, sigma1: ArrayLike, mu2: ArrayLike, sigma2: ArrayLike) -> float:
+    """Squared Fréchet distance between two Gaussians with means (d,) and covariances (d, d).
+
+    |mu1 - mu2|^2 + tr(sigma1) + tr(sigma2) - 2 tr((sigma1 sigma2)^(1/2)). With sigma = factor' factor the last trace
+    is the sum of the singular values of factor1 factor2'; factors come from symmetric eigenvalues.
+
+    Raises:
+        ValueError: shapes differ, a value is not finite, or a sigma is no covariance.
+    """
+    means = [np.atleast_1d(np.asarray(mu, dtype=np.float64)) for mu in (mu1, mu2)]
+    sigmas = [np.atleast_2d(np.asarray(sigma, dtype=np.float64)) for sigma in (sigma1, sigma2)]
+    size = len(means[0])
+    for mean, sigma in zip(means, sigmas, strict=True):
+        if mean.shape != (size,) or sigma.shape != (size, size):
+            raise ValueError(
+                f"mean {mean.shape} and covariance {sigma.shape} must be ({size},) and ({size}, {size})"
+            )
+    return _distance(means[0], _factor_of(sigmas[0]), means[1], _factor_of(sigmas[1]))
+
+
+def frechet_distance_from_features(x: ArrayLike, y: ArrayLike) -> float:
+    """Squared Fréchet distance between Gaussians fitted to features (n, d) and (m, d): FID where these are Inception's.
+
+    Covariances are the unbiased ones (n - 1). The centred features are a factor of the covariance already, so none
+    is formed: with fewer rows than columns they serve as they are, with more their triangular factor does.
+    With fewer images than features the covariances have less than full rank, and the distance between two draws
+    of one distribution is far from zero: compare such distances at equal n alone.
+
+    Raises:
+        ValueError: fewer than 2 rows, unequal widths, or a value that is not finite.
+    """
+    first, second = _features(x, y, least=2)
+    return _distance(*_mean_and_factor(first), *_mean_and_factor(second))
+
+
+@dataclass(frozen=True)
+class KernelDistance:
+    """Mean of the unbiased estimate over subsets, and its standard error; the mean can be negative.
+
+    standard_error: of the estimate from all images, by the delete-d jackknife (Shao and Wu 1989): the deviation over
+    subsets of m of n images, drawn without replacement, times sqrt(m / (n - m)). None with fewer than 4 images.
+    """
+
+    value: float
+    standard_error: float | None
+    subsets: int
+    subset_size: int
+
+
+def kernel_distance(
+    x: ArrayLike,
+    y: ArrayLike,
+    seed: int = 0,
+    subsets: int = SUBSETS,
+    largest_subset: int = LARGEST_SUBSET,
+) -> KernelDistance:
+    """Squared maximum mean discrepancy between features (n, d) and (m, d): KID where these are Inception's.
+
+    Kernel (x . y / d + 1)^3, the unbiased estimate, which leaves a set's pairs of an image with itself out. A
+    subset has half of the smaller set from each, at most `largest_subset`.
+
+    Raises:
+        ValueError: fewer than 2 rows, unequal widths, or a value that is not finite.
+    """
+    first, second = _features(x, y, least=2)
+    n = min(len(first), len(second))
+    if n < 4:
+        return KernelDistance(_mmd2(first, second), None, 1, n)
+    size = min(largest_subset, n // 2)
+    generator = np.random.default_rng(seed)
+    values = [
+        _mmd2(
+            first[generator.choice(len(first), size, replace=False)],
+            second[generator.choice(len(second), size, replace=False)],
+        )
+        for _ in range(subsets)
+    ]
+    error = float(np.std(values, ddof=1)) * math.sqrt(size / (n - size)) if subsets > 1 else None
+    return KernelDistance(float(np.mean(values)), error, subsets, size)
+
+
+def _features(x: ArrayLike, y: ArrayLike, least: int) -> tuple[Array, Array]:
+    first, second = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+    for features in (first, second):
+        if features.ndim != 2 or features.shape[1] == 0 or features.shape[1] != first.shape[-1]:
+            raise ValueError(f"features {first.shape} and {second.shape} must be (n, d) and (m, d)")
+        if len(features) < least:
+            raise ValueError(f"{len(features)} images have no covariance; expected at least {least}")
+        if not np.isfinite(features).all():
+            raise ValueError("a feature is not finite: look for the image that it comes from")
+    return first, second
+
+
+def _mean_and_factor(features: Array) -> tuple[Array, Array]:
+    """Mean (d,) and a factor (min(n, d), d) whose square factor' factor is the covariance."""
+    mean = features.mean(axis=0)
+    factor = (features - mean) / math.sqrt(len(features) - 1)
+    if len(factor) > factor.shape[1]:
+        factor = np.linalg.qr(factor, mode="r")
+    return mean, factor
+
+
+def _factor_of(sigma: Array) -> Array:
+    """A factor (d, d) of a covariance; ValueError where it is none."""
+    if not np.isfinite(sigma).all():
+        raise ValueError("a covariance holds values that are not finite")
+    largest = float(np.abs(sigma).max())
+    if not np.allclose(sigma, sigma.T, rtol=0.0, atol=ROUNDING * largest):
+        raise ValueError("a covariance is symmetric; this matrix is not")
+    values, vectors = np.linalg.eigh((sigma + sigma.T) / 2)
+    if values[0] < -ROUNDING * len(sigma) * largest:
+        raise ValueError(f"a covariance has no negative eigenvalue; this matrix has {values[0]:.3g}")
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+
+
+def _distance(mean1: Array, factor1: Array, mean2: Array, factor2: Array) -> float:
+    if not (np.isfinite(mean1).all() and np.isfinite(mean2).all()):
+        raise ValueError("a mean holds values that are not finite")
+    traces = float((factor1**2).sum() + (factor2**2).sum())
+    shared = float(np.linalg.svd(factor1 @ factor2.T, compute_uv=False).sum())
+    # Rounding alone can bring the difference of equal sums below zero.
+    return float(((mean1 - mean2) ** 2).sum()) + max(0.0, traces - 2.0 * shared)
+
+
+def _mmd2(x: Array, y: Array) -> float:
+    """The unbiased estimate from all pairs of x (n, d) and y (m, d) but those of a row with itself."""
+    width = x.shape[1]
+
+    def kernel(a: Array, b: Array) -> Array:
+        return np.asarray((a @ b.T / width + 1.0) ** 3)
+
+    within = 0.0
+    for features in (x, y):
+        values = kernel(features, features)
+        np.fill_diagonal(values, 0.0)
+        within += float(values.sum()) / (len(features) * (len(features) - 1))
+    return within - 2.0 * float(kernel(x, y).mean())
