@@ -89,7 +89,8 @@ def test_malformed_yaml(text: str, message: str) -> None:
 
 def test_missing_file_lists_what_is_there(tmp_path: Path) -> None:
     with pytest.raises(
-        SpecError, match=r"known by name: city_adapted, city_bench, .*, demo, pandaset_002, pandaset_002_adapted"
+        SpecError,
+        match=r"known by name: city_adapted, city_bench, .*, demo, pandaset_002, pandaset_002_adapted",
     ):
         load_experiment("demmo", configs(CATALOG))
     with pytest.raises(SpecError, match="no such file"):
@@ -266,6 +267,7 @@ def test_ablations_differ_from_city_bench_in_what_they_are_named_after() -> None
     for name, path, value in (
         ("no_kl", ("reconstruct", "weights", "kl"), 0.0),
         ("perceptual", ("reconstruct", "weights", "perceptual"), 0.1),
+        ("free_planes", ("reconstruct", "model", "decoder"), False),
     ):
         ablation = load_experiment(f"city_bench_{name}", configs(CATALOG)).resolved()
         assert dict(_differences(whole, ablation)).keys() == {("name",), ("description",), path}
