@@ -83,9 +83,9 @@ def measure(
 ) -> Sequence[Row]:
     """Rows of the renderers, each with its speed-up over the first, then of the parts of the product's.
 
-    All render the same crops, features and image network, in turn; ms are medians over rounds. dB are those to the
-    log's images, below the dense reference's. GFLOP are those of the networks; limit_ms is what they take at the rate of a
-    large matrix product, measured in the same run.
+    All render the same crops, features and image network, in turn; ms are medians over rounds. dB are those to
+    the log's images, below the dense reference's. GFLOP are those of the networks; limit_ms is what they take at the
+    rate of a large matrix product, measured in the same run.
     """
     import numpy as np
 
@@ -315,7 +315,7 @@ def matrix_gflops(side: int = 1024, tries: int = 7) -> float:
 BENCHMARK = Benchmark(
     name="rendering",
     summary=f"Crops of the {CROPS} largest actors in view: the dense reference (5 and 30 cm everywhere, no cull), "
-    "uniform steps where LiDAR or a box is, and the product; then where the product's time goes. Aim: 10 times faster than the "
-    "dense reference at most 0.1 dB below it",
+    "uniform steps where LiDAR or a box is, and the product; then where the product's time goes. Aim: 10 times faster "
+    "than the dense reference at most 0.1 dB below it",
     run=run,
 )

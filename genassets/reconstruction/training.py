@@ -92,6 +92,7 @@ def render_settings(settings: RenderingSettings) -> RenderSettings:
         settings.background_far,
         settings.sky_samples,
         settings.weight_threshold,
+        least_light=settings.least_light,
     )
 
 
