@@ -139,7 +139,7 @@ def _picture(
     image = np.clip(picture.rgb * coverage + OUTSIDE * (1 - coverage), 0, 1)
     mask = picture.instances > 0
     rows, columns = np.nonzero(mask)
-    origins, directions = view.rays(np.stack((columns, rows), axis=-1) + 0.5)
+    origins, directions = view.rays(np.stack((columns, rows), axis=-1).astype(np.float64) + 0.5)
     along = picture.depth[mask] / (directions @ view.scene_from_camera[:3, 2])
     return image.astype(np.float32), mask, origins + directions * along[:, None]
 

@@ -46,7 +46,7 @@ PARTS = {
     ),
     "image network": (("genassets.rendering.rgb_network.RgbNetwork", "forward"),),
 }
-"""Parts of rendering by the functions that do them; none of these calls another."""
+"""Parts of rendering by the functions that do them."""
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,7 @@ def choose_crops(log: Log, renderer: SceneRenderer, count: int) -> list[Crop]:
     found = []
     for bounds in view.bounds[np.argsort(-sides.prod(axis=1), kind="stable")[:count]]:
         middle, half = (bounds[:2] + bounds[2:]) / 2, np.minimum(bounds[2:] - bounds[:2], LARGEST) / 2
-        x0, y0, x1, y1 = (*(middle - half), *(middle + half))
+        (x0, y0), (x1, y1) = (middle - half).tolist(), (middle + half).tolist()
         region = comparison_region((x0, y0, x1, y1), view.intrinsics.width, view.intrinsics.height)
         found.append(Crop(region, crop(image, region)))
     return found
@@ -225,8 +225,11 @@ DENSE_ROWS = 4
 
 
 @contextmanager
-def _timed(owner: str, name: str, taken: list[float]) -> Iterator[None]:
-    """Add up in `taken` the seconds of every call of a function while the context lasts."""
+def _timed(owner: str, name: str, taken: list[float], running: list[str]) -> Iterator[None]:
+    """Add to `taken` the seconds of every call of a function while the context lasts.
+
+    Calls from within another timed function, which `running` names, are part of that one.
+    """
     from importlib import import_module
 
     module, _, cls = owner.rpartition(".")
@@ -234,9 +237,13 @@ def _timed(owner: str, name: str, taken: list[float]) -> Iterator[None]:
     original = getattr(holder, name)
 
     def call(*arguments: Any, **named: Any) -> Any:
+        if running:
+            return original(*arguments, **named)
+        running.append(name)
         start = time.perf_counter()
         result = original(*arguments, **named)
         taken.append(time.perf_counter() - start)
+        running.pop()
         return result
 
     setattr(holder, name, call)
@@ -253,10 +260,11 @@ def part_seconds(work: Callable[[], object], rounds: int) -> tuple[dict[str, flo
     parts, wholes = [], []
     for _ in range(rounds):
         taken: dict[str, list[float]] = {name: [] for name in PARTS}
+        running: list[str] = []
         with ExitStack() as stack:
             for part, functions in PARTS.items():
                 for owner, name in functions:
-                    stack.enter_context(_timed(owner, name, taken[part]))
+                    stack.enter_context(_timed(owner, name, taken[part], running))
             start = time.perf_counter()
             work()
             wholes.append(time.perf_counter() - start)

@@ -215,6 +215,7 @@ class _Evaluated:
     background_intermediate: Tensor
 
     def select(self, actor: Bool[Tensor, " actor"], background: Bool[Tensor, " background"]) -> _Evaluated:
+        """The samples of either field that are wanted."""
         keep = torch.cat((actor, background))
         return _Evaluated(
             self.log_transmittance[keep],
