@@ -62,6 +62,7 @@ def settings(steps: int) -> ReconstructionSettings:
             rgb_blocks=1,
             rgb_upsamplings=0,
             coarse_resolution=16,
+            shadow_hidden=0,
         ),
         rendering=RenderingSettings(
             actor_step=0.15, background_step=60.0, background_far=50.0, sky_samples=1, coarse_refresh=4
