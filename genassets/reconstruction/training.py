@@ -100,8 +100,8 @@ class Trainer:
     """Model, optimisers and step counter; everything random in a step comes from (seed, step).
 
     That makes a run that was killed and resumed from a checkpoint equal to one that was not. Parameters that ask for
-    no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw: what
-    a view of a step is made of.
+    no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw:
+    what a view of a step is made of.
     """
 
     def __init__(
