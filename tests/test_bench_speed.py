@@ -79,7 +79,7 @@ def test_what_is_shown_is_what_is_trained(task: CarTask) -> None:
         {"patches": 1, "patch_size": 24, "patch_margin": 4, "decoded_actors": 1, "mirror_share": 0.0},
     )
     model = build_model(task.assets, ["cars"], settings, 0)
-    trainer = Trainer(model, [task.data], settings, 0, draw_patches)
+    trainer = Trainer(model, [task.data], settings, 0, draw=draw_patches)
     batch = draw_patches(task.data, settings, 1, np.random.default_rng(2))
     with torch.no_grad():
         loss = trainer.losses(0, batch, None)[0].losses["rgb"].item()

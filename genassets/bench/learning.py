@@ -91,7 +91,7 @@ def learn(task: CarTask, chosen: ReconstructionSettings, looks: int, say: Callab
     from genassets.reconstruction.training import Trainer, build_model
 
     model = build_model(task.assets, [LOG], chosen, SEED)
-    trainer = Trainer(model, [task.data], chosen, SEED, draw_patches)
+    trainer = Trainer(model, [task.data], chosen, SEED, draw=draw_patches)
     seconds = cpu_seconds = 0.0
     rows: list[Row] = []
     for look in range(1, looks + 1):
