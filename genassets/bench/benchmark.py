@@ -22,11 +22,22 @@ class Benchmark:
 
 def benchmarks() -> tuple[Benchmark, ...]:
     """Every benchmark, in the order of the table. Modules import heavy libraries inside ``run``."""
-    from genassets.bench import adaptation_start, masks, pipeline_overhead, visible_cost
+    from genassets.bench import (
+        adaptation_start,
+        learning,
+        masks,
+        pipeline_overhead,
+        rendering,
+        training,
+        visible_cost,
+    )
 
     return (
         pipeline_overhead.BENCHMARK,
         masks.BENCHMARK,
         visible_cost.BENCHMARK,
         adaptation_start.BENCHMARK,
+        rendering.BENCHMARK,
+        learning.BENCHMARK,
+        training.BENCHMARK,
     )

@@ -17,6 +17,12 @@ def half_planes(planes: Float[Tensor, "n planes channels height width"]) -> Tens
     return planes.detach().clamp(-largest, largest).half()
 
 
+def resized_planes(scale: float, planes: Float[Tensor, "planes channels height width"]) -> Tensor:
+    """One actor's planes with `scale` times as many texels a side, at least 2; those at the ends stay in place."""
+    side = [max(2, round(texels * scale)) for texels in planes.shape[-2:]]
+    return F.interpolate(planes.detach(), side, mode="bilinear", align_corners=True)
+
+
 def interpolate_triplanes(
     planes: Float[Tensor, "slots planes channels height width"],
     slot: Int[Tensor, " samples"],

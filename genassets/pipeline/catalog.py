@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from genassets.stages import (
     evaluate_reconstruction,
+    evaluate_speed_error,
     evaluate_turns,
     filter_occlusion,
     ingest,
@@ -25,6 +26,7 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_reconstruction.STAGE,
     evaluate_turns.STAGE,
     turntables.STAGE,
+    evaluate_speed_error.STAGE,
 )
 
 
@@ -34,11 +36,11 @@ def configs(catalog: Iterable[Stage]) -> dict[str, type[BaseModel]]:
 
 
 def wanted_stages(catalog: Iterable[Stage], names: Iterable[str] | None) -> tuple[Stage, ...]:
-    """The named stages and all that they need, in the catalog's order; all for None."""
+    """The named stages and all that they need, in the catalog's order; for None all that don't wait to be named."""
     ordered = tuple(catalog)
     by_name: Mapping[str, Stage] = {stage.name: stage for stage in ordered}
     if names is None:
-        return ordered
+        names = [stage.name for stage in ordered if not stage.on_request]
     wanted: set[str] = set()
     waiting = list(names)
     while waiting:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
@@ -35,6 +36,8 @@ from genassets.rendering.renderer import (
 )
 
 RAYS_AT_ONCE = 8192
+SAMPLES_AT_ONCE = 2**20
+"""Rays are rendered in strips of at most so many samples before culls, so that short steps need no more memory."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,8 @@ class SceneRenderer:
     """Renders logs and actors of a library; keeps the planes of the last actors that it decoded.
 
     settings: how samples are placed and culled, by default as the library says. keep: what is done to an
-    actor's decoded planes before they are kept. A library whose model is in float64 is rendered in it.
+    actor's decoded planes before they are kept. coarser: of a region's feature pixels only one in so many squared is
+    rendered, the others lie between. A library whose model is in float64 is rendered in it.
     """
 
     def __init__(
@@ -73,9 +77,11 @@ class SceneRenderer:
         library: AssetLibrary,
         settings: RenderSettings | None = None,
         keep: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+        coarser: int = 1,
     ) -> None:
-        self.library = library
+        self.library, self._coarser = library, coarser
         self._settings = settings or render_settings(library.settings.rendering)
+        self._rays_at_once = min(RAYS_AT_ONCE, max(1, SAMPLES_AT_ONCE // self._settings.samples_of_a_ray))
         self._keep = keep
         self._dtype = next(library.model.parameters()).dtype
         # Feature pixels rendered around a region, so that the image network sees no border inside it.
@@ -119,28 +125,37 @@ class SceneRenderer:
         """The composited scene in a region x0, y0, x1, y1 of the rendered image, the whole by default."""
         view = self.view(log, camera, frame)
         x0, y0, x1, y1 = region or (0, 0, view.intrinsics.width, view.intrinsics.height)
-        stride, context = self.library.model.stride, self._context
+        fine, coarser = self.library.model.stride, self._coarser
+        stride = fine * coarser
+        # One more where the map is interpolated, so that its edge is not held inside the region.
+        context = -(-self._context // coarser) + (coarser > 1)
         fx0, fy0 = x0 // stride - context, y0 // stride - context
         fx1, fy1 = -(-x1 // stride) + context, -(-y1 // stride) + context
-        rows_at_once = max(1, RAYS_AT_ONCE // (fx1 - fx0))
+        rows_at_once = max(1, self._rays_at_once // (fx1 - fx0))
         background = self.library.model.background_fields(
             self.library.model.logs.index(log.name), self.library.occupancy[log.name]
         )
         coarse = self.library.model.coarse_actors()
         strips, counts = [], []
         for top in range(fy0, fy1, rows_at_once):
-            rows = (fx0, top, fx1, min(top + rows_at_once, fy1))
-            rays = region_rays(view, rows, stride, self._dtype, self.library.model.shadow is not None)
+            strip = (fx0, top, fx1, min(top + rows_at_once, fy1))
+            rays = region_rays(view, strip, stride, self._dtype, self.library.model.shadow is not None)
             culled = cull(rays, coarse, self._settings)
             met = torch.nonzero(culled.samples_of_actors(rays))[:, 0].tolist()
-            fields = self._fields(met or [0])  # one stands in where none is met
+            fields = self.fields(met or [0])  # one stands in where none is met
             out = render_rays(rays, culled, fields, background, self._settings)
             strips.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
             counts.append(out.counts)
         maps = torch.cat(strips).reshape(1, fy1 - fy0, fx1 - fx0, -1).permute(0, 3, 1, 2)
+        if coarser > 1:
+            maps = F.interpolate(maps, scale_factor=coarser, mode="bilinear", align_corners=False)
         image = self.library.model.rgb(maps[:, :-2]).clamp(0, 1)[0].permute(1, 2, 0).float().numpy()
         left, top = x0 - fx0 * stride, y0 - fy0 * stride
-        inner = maps[0, -2:, context : fy1 - fy0 - context, context : fx1 - fx0 - context].double().numpy()
+        columns, rows = (
+            slice(low // fine - first * coarser, -(-high // fine) - first * coarser)
+            for low, high, first in ((x0, x1, fx0), (y0, y1, fy0))
+        )
+        inner = maps[0, -2:, rows, columns].double().numpy()
         return RegionView(
             image[top : top + y1 - y0, left : left + x1 - x0],
             inner[0],
@@ -164,10 +179,10 @@ class SceneRenderer:
         directions = transform_directions(box_from_camera, pixel_directions(intrinsics, pixels))
         origins = np.broadcast_to(np.asarray(box_from_camera)[:3, 3], directions.shape)
         size = self.assets.loc[actor, ["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
-        fields = self._fields([actor])
+        fields = self.fields([actor])
         parts = []
-        for start in range(0, len(origins), RAYS_AT_ONCE):
-            chunk = slice(start, start + RAYS_AT_ONCE)
+        for start in range(0, len(origins), self._rays_at_once):
+            chunk = slice(start, start + self._rays_at_once)
             rays = cast_rays(origins[chunk], directions[chunk], [actor], np.eye(4)[None], size[None])
             culled = cull(rays, self.library.model.coarse_actors(), self._settings)
             out = render_rays(rays, culled, fields, None, self._settings)
@@ -177,8 +192,7 @@ class SceneRenderer:
         feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
         rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3)).clamp(0, 1)
         alpha, distance = (
-            torch.nn.functional.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False)
-            for m in (alpha, distance)
+            F.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False) for m in (alpha, distance)
         )
         margin = context * stride
 
@@ -199,7 +213,7 @@ class SceneRenderer:
         Returns the grid, the position (3,) of its first value and the spacing (3,) between values.
         """
         actor = self.library.index_of(log_name, actor_id)
-        fields = self._fields([actor])
+        fields = self.fields([actor])
         half = padded_half_size(self.library.model.sizes)[actor]
         position = cell_centres(resolution) * half
         index = torch.full((RAYS_AT_ONCE,), actor)
@@ -208,7 +222,7 @@ class SceneRenderer:
         spacing = (2 * half / resolution).double().numpy()
         return grid.numpy(), position[0].double().numpy(), spacing
 
-    def _fields(self, actors: list[int]) -> ActorFields:
+    def fields(self, actors: list[int]) -> ActorFields:
         """Fields of some actors, each decoded once."""
         planes = torch.stack([self._planes(actor) for actor in actors])
         return self.library.model.actor_fields(torch.tensor(actors), planes)

@@ -69,6 +69,10 @@ class RenderingSettings(_Settings):
     background_far: PositiveFloat = 80.0
     sky_samples: Annotated[int, Field(ge=1)] = 8
     weight_threshold: Annotated[float, Field(ge=0, lt=1)] = 3e-3
+    least_light: Annotated[float, Field(ge=0, lt=1)] = Field(
+        default=0.0,
+        description="share of a ray's light at which it is followed no further, front to back; 0 follows all at once",
+    )
     occupancy_cell: PositiveFloat = 0.5
     occupancy_dilation: Annotated[int, Field(ge=0)] = 1
     coarse_refresh: PositiveInt = Field(

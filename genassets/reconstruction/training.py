@@ -55,6 +55,7 @@ CURVE_EVERY = 20
 
 Progress = Callable[[float, float, str], None]
 Curve = Callable[[str, int, float], None]
+Draw = Callable[[TrainingLog, ReconstructionSettings, int, np.random.Generator], Batch]
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,7 @@ def render_settings(settings: RenderingSettings) -> RenderSettings:
         settings.background_far,
         settings.sky_samples,
         settings.weight_threshold,
+        least_light=settings.least_light,
     )
 
 
@@ -98,7 +100,8 @@ class Trainer:
     """Model, optimisers and step counter; everything random in a step comes from (seed, step).
 
     That makes a run that was killed and resumed from a checkpoint equal to one that was not. Parameters that ask for
-    no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns.
+    no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw:
+    what a view of a step is made of.
     """
 
     def __init__(
@@ -108,8 +111,10 @@ class Trainer:
         settings: ReconstructionSettings,
         seed: int,
         pull: LatentPull | None = None,
+        draw: Draw = draw_batch,
     ):
         self.model, self.data, self.settings, self.seed, self.pull = model, data, settings, seed, pull
+        self._draw = draw
         self.step = 0
         self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
         self.planes = RememberedPlanes()  # what a step that only looks past an actor uses
@@ -164,7 +169,7 @@ class Trainer:
         rng = np.random.default_rng([self.seed, self.step, view])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         log = int(rng.choice(len(self.data), p=self.log_chance))
-        batch = draw_batch(self.data[log], self.settings, self.model.stride, rng)
+        batch = self._draw(self.data[log], self.settings, self.model.stride, rng)
         result, fields = self.losses(log, batch, generator)
         weights = self.settings.weights.model_dump()
         for term, value in result.losses.items():

@@ -285,7 +285,7 @@ def draw_batch(
     for _ in range(settings.patches):
         shown = draw_observation() if rng.random() >= settings.background_share else None
         bounds = shown.bounds if shown else None
-        column, row = _place_patch(view, bounds, settings.patch_size, stride, rng)
+        column, row = place_patch(view, bounds, settings.patch_size, stride, rng)
         parts.append(
             patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride, shadows)
         )
@@ -372,7 +372,7 @@ def _rays_at_once(
     )
 
 
-def _place_patch(
+def place_patch(
     view: View,
     bounds: tuple[float, float, float, float] | None,
     size: int,

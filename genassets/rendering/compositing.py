@@ -30,22 +30,34 @@ def log_light(
     """
     bounded = log_transmittance.double().clamp(min=OPAQUE)
     before = bounded.cumsum(0) - bounded
+    return before - before[_first_of_ray(ray)]
+
+
+def rank_along_ray(ray: Int[Tensor, " samples"]) -> Int[Tensor, " samples"]:
+    """How many samples of its ray each sorted sample has before it."""
+    return torch.arange(len(ray), device=ray.device) - _first_of_ray(ray)
+
+
+def _first_of_ray(ray: Int[Tensor, " samples"]) -> Int[Tensor, " samples"]:
+    """The place of the first sample of each sorted sample's ray."""
     starts = torch.ones_like(ray, dtype=torch.bool)
     starts[1:] = ray[1:] != ray[:-1]
-    first = torch.nonzero(starts)[:, 0]
-    return before - before[first][starts.long().cumsum(0) - 1]
+    return torch.nonzero(starts)[:, 0][starts.long().cumsum(0) - 1]
 
 
 def render_weights(
-    log_transmittance: Float[Tensor, " samples"], ray: Int[Tensor, " samples"]
+    log_transmittance: Float[Tensor, " samples"],
+    ray: Int[Tensor, " samples"],
+    before: Float[Tensor, " samples"] | float = 0.0,
 ) -> Float[Tensor, " samples"]:
     """Weights w_i = alpha_i prod_{j<i} (1 - alpha_j) of sorted samples (paper eq. 2).
 
-    log_transmittance is log(1 - alpha) of each sample, -inf allowed for an opaque one. For alphas 0.5, 0.5, 1
-    on one ray the weights are 0.5, 0.25, 0.25.
+    log_transmittance is log(1 - alpha) of each sample, -inf allowed for an opaque one; before is the logarithm of
+    the light that is left of each sample's ray before its first one. For alphas 0.5, 0.5, 1 on one ray the weights
+    are 0.5, 0.25, 0.25.
     """
     opacity = -torch.expm1(log_transmittance.double().clamp(min=OPAQUE))
-    return (torch.exp(log_light(log_transmittance, ray)) * opacity).to(log_transmittance.dtype)
+    return (torch.exp(log_light(log_transmittance, ray) + before) * opacity).to(log_transmittance.dtype)
 
 
 OPAQUE = -100.0

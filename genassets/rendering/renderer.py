@@ -6,6 +6,8 @@ gradients finds the weights, and only samples that carry weight are evaluated wi
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +20,14 @@ from genassets.fields.opacity import log_transmittance
 from genassets.fields.shadow import ShadowHead, darken
 from genassets.fields.shape_prior import bounded_distance
 from genassets.fields.triplane import interpolate_triplanes
-from genassets.rendering.compositing import OPAQUE, accumulate, depth_order, log_light, render_weights
+from genassets.rendering.compositing import (
+    OPAQUE,
+    accumulate,
+    depth_order,
+    log_light,
+    rank_along_ray,
+    render_weights,
+)
 from genassets.rendering.rays import BOX_PADDING, Rays
 from genassets.rendering.sampling import (
     ActorSamples,
@@ -46,12 +55,23 @@ CLEAR_BEYOND = 4.0
 LOG_HIDDEN = -6.0
 """A sample is hidden where less than exp of this of the light gets through to it."""
 
+NEGLIGIBLE = 1e-18
+"""A share of a ray's light that adds nothing in double precision, not even a thousand times over."""
+
+LONG_WAY = 5.0
+"""Metres of boxes that a ray through traffic crosses: a car's length."""
+
+RANKS_AT_ONCE = 16
+"""Samples of a ray that are evaluated together when rays are followed front to back."""
+
 
 @dataclass(frozen=True)
 class RenderSettings:
     """Step lengths and culls of one rendering. All lengths in metres.
 
-    exact: no coarse distance and no weight threshold; every sample of every crossed box is evaluated.
+    exact: no coarse distance; samples of all of every crossed box are there to be evaluated. least_light: front to
+    back, a ray goes no further once less than this share of its light is left; 0 evaluates all of a ray at once. With
+    `exact` and both this and weight_threshold at NEGLIGIBLE, what is left out is beyond double precision.
     """
 
     actor_step: float
@@ -63,6 +83,19 @@ class RenderSettings:
     sky_samples: int
     weight_threshold: float
     exact: bool = False
+    least_light: float = 0.0
+
+    @property
+    def samples_of_a_ray(self) -> int:
+        """Roughly how many samples a ray has before any cull: what memory is planned by."""
+        return math.ceil(LONG_WAY / self.actor_step) + len(self.background_edges) + self.sky_samples
+
+    @property
+    def background_edges(self) -> Float[Tensor, " edges"]:
+        """Edges of the intervals outside boxes."""
+        return step_edges(
+            self.background_near, self.background_far, self.background_step, self.background_growth
+        )
 
 
 @dataclass(frozen=True)
@@ -181,6 +214,34 @@ class _Evaluated:
     actor_intermediate: Tensor
     background_intermediate: Tensor
 
+    def select(self, actor: Bool[Tensor, " actor"], background: Bool[Tensor, " background"]) -> _Evaluated:
+        """The samples of either field that are wanted."""
+        keep = torch.cat((actor, background))
+        return _Evaluated(
+            self.log_transmittance[keep],
+            self.ray[keep],
+            self.distance[keep],
+            self.actor_intermediate[actor],
+            self.background_intermediate[background],
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Evaluated]) -> _Evaluated:
+        """All parts' samples, actors' first again."""
+        counts = [len(part.actor_intermediate) for part in parts]
+
+        def both(name: str) -> Tensor:
+            halves = [getattr(p, name).tensor_split([n]) for p, n in zip(parts, counts, strict=True)]
+            return torch.cat([actor for actor, _ in halves] + [static for _, static in halves])
+
+        return cls(
+            both("log_transmittance"),
+            both("ray"),
+            both("distance"),
+            torch.cat([part.actor_intermediate for part in parts]),
+            torch.cat([part.background_intermediate for part in parts]),
+        )
+
 
 def cull(
     rays: Rays, coarse: CoarseActors, settings: RenderSettings, generator: torch.Generator | None = None
@@ -213,24 +274,9 @@ def render_rays(
     static = near if background is None else _with_sky(near, rays, settings)
 
     with torch.no_grad():
-        evaluated = _evaluate(occupied, static, rays, actors, background)
-        order = depth_order(evaluated.ray, evaluated.distance)
-        weight = torch.empty_like(evaluated.distance)
-        weight[order] = render_weights(evaluated.log_transmittance[order], evaluated.ray[order])
-    threshold = 0.0 if settings.exact else settings.weight_threshold
-    keep = weight >= threshold
-    keep_actor, keep_static = keep[: len(occupied.hit)], keep[len(occupied.hit) :]
-    seen, static = occupied.select(keep_actor), static.select(keep_static)
+        seen, static, evaluated, count = _visible(occupied, static, rays, actors, background, settings)
     if torch.is_grad_enabled():
         evaluated = _evaluate(seen, static, rays, actors, background)
-    else:
-        evaluated = _Evaluated(
-            evaluated.log_transmittance[keep],
-            evaluated.ray[keep],
-            evaluated.distance[keep],
-            evaluated.actor_intermediate[keep_actor],
-            evaluated.background_intermediate[keep_static],
-        )
 
     feature = actors.field.feature(evaluated.actor_intermediate, rays.hits.direction[seen.hit])
     if background is not None:
@@ -262,7 +308,7 @@ def render_rays(
             len(occupied.hit),
             outside_boxes,
             len(near.ray),
-            len(keep),
+            count,
             len(ray),
         ),
     )
@@ -349,6 +395,58 @@ def _shaded(
     return darken(feature, torch.zeros_like(feature).index_add(0, sample, log_light[entry]))
 
 
+def _visible(
+    boxed: ActorSamples,
+    static: BackgroundSamples,
+    rays: Rays,
+    actors: ActorFields,
+    background: BackgroundFields | None,
+    settings: RenderSettings,
+) -> tuple[ActorSamples, BackgroundSamples, _Evaluated, int]:
+    """The samples of both kinds that weigh enough, evaluated, and how many had to be evaluated to find them.
+
+    Rays are followed front to back, RANKS_AT_ONCE samples at a time, for as long as they have light.
+    """
+    ray = torch.cat((rays.hits.ray[boxed.hit], static.ray))
+    order = depth_order(ray, torch.cat((boxed.distance, static.distance)))
+    light = torch.zeros(len(rays), dtype=torch.float64, device=ray.device)
+    seen, seen_static, parts, count = [], [], [], 0
+    for ranks in _by_rank(order, ray) if settings.least_light else (order,):
+        lit = ranks[light[ray[ranks]] >= math.log(settings.least_light)] if settings.least_light else ranks
+        in_box = lit < len(boxed.hit)
+        part = boxed.select(lit[in_box]), static.select(lit[~in_box] - len(boxed.hit))
+        evaluated = _evaluate(*part, rays, actors, background)
+        split = len(part[0].hit)
+        absorbed = torch.empty_like(evaluated.log_transmittance)
+        absorbed[in_box], absorbed[~in_box] = evaluated.log_transmittance.tensor_split([split])
+        before = light[ray[lit]]
+        weight = render_weights(absorbed, ray[lit], before)
+        keep = weight >= settings.weight_threshold
+        light.index_add_(0, ray[lit], absorbed.double().clamp(min=OPAQUE))
+        keep_actor, keep_static = keep[in_box], keep[~in_box]
+        seen.append(part[0].select(keep_actor))
+        seen_static.append(part[1].select(keep_static))
+        parts.append(evaluated.select(keep_actor, keep_static))
+        count += len(lit)
+    if len(parts) == 1:
+        return seen[0], seen_static[0], parts[0], count
+    return (
+        ActorSamples.joined(seen),
+        BackgroundSamples.joined(seen_static),
+        _Evaluated.joined(parts),
+        count,
+    )
+
+
+def _by_rank(order: Int[Tensor, " samples"], ray: Int[Tensor, " samples"]) -> list[Tensor]:
+    """Sorted samples in groups: the first RANKS_AT_ONCE of every ray, the next, and so on; sorted in each."""
+    if not len(order):
+        return [order]
+    group = rank_along_ray(ray[order]) // RANKS_AT_ONCE
+    by_group = torch.argsort(group, stable=True)
+    return list(order[by_group].split(torch.bincount(group).tolist()))
+
+
 def _background_samples(
     rays: Rays,
     background: BackgroundFields | None,
@@ -359,24 +457,13 @@ def _background_samples(
     if background is None:
         none = torch.zeros(0, device=rays.origin.device)
         return BackgroundSamples(none.long(), none.reshape(0, 3), none, none), 0
-    edges = step_edges(
-        settings.background_near,
-        settings.background_far,
-        settings.background_step,
-        settings.background_growth,
-    )
-    return sample_background(rays, edges, background.occupancy, generator)
+    return sample_background(rays, settings.background_edges, background.occupancy, generator)
 
 
 def _with_sky(near: BackgroundSamples, rays: Rays, settings: RenderSettings) -> BackgroundSamples:
     """The samples with those beyond background_far after them."""
     sky = sample_sky(rays, settings.sky_samples, settings.background_far)
-    return BackgroundSamples(
-        torch.cat((near.ray, sky.ray)),
-        torch.cat((near.position, sky.position)),
-        torch.cat((near.distance, sky.distance)),
-        torch.cat((near.step, sky.step)),
-    )
+    return BackgroundSamples.joined((near, sky))
 
 
 def _may_be_seen(samples: ActorSamples, rays: Rays, coarse: CoarseActors) -> Bool[Tensor, " samples"]:

@@ -5,9 +5,11 @@ Camera and LiDAR rays are cut into intervals; each interval becomes one sample a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -26,6 +28,16 @@ class ActorSamples:
     def select(self, keep: Tensor) -> ActorSamples:
         return ActorSamples(self.hit[keep], self.position[keep], self.distance[keep], self.step[keep])
 
+    @classmethod
+    def joined(cls, parts: Sequence[ActorSamples]) -> ActorSamples:
+        """All parts' samples, one part after another."""
+        return cls(
+            torch.cat([part.hit for part in parts]),
+            torch.cat([part.position for part in parts]),
+            torch.cat([part.distance for part in parts]),
+            torch.cat([part.step for part in parts]),
+        )
+
 
 @dataclass(frozen=True)
 class BackgroundSamples:
@@ -38,6 +50,16 @@ class BackgroundSamples:
 
     def select(self, keep: Tensor) -> BackgroundSamples:
         return BackgroundSamples(self.ray[keep], self.position[keep], self.distance[keep], self.step[keep])
+
+    @classmethod
+    def joined(cls, parts: Sequence[BackgroundSamples]) -> BackgroundSamples:
+        """All parts' samples, one part after another."""
+        return cls(
+            torch.cat([part.ray for part in parts]),
+            torch.cat([part.position for part in parts]),
+            torch.cat([part.distance for part in parts]),
+            torch.cat([part.step for part in parts]),
+        )
 
 
 def sample_actors(rays: Rays, step: float, growth: float, generator: torch.Generator | None) -> ActorSamples:
@@ -128,6 +150,12 @@ class OccupancyGrid:
     cells: Bool[Tensor, "x y z"]
     lower: Float[Tensor, 3]
     cell: float
+
+    def coarser(self, longer: int) -> OccupancyGrid:
+        """The grid with cells `longer` times as long, each occupied where any cell within is."""
+        padding = [end for length in reversed(self.cells.shape) for end in (0, -length % longer)]
+        cells = F.max_pool3d(F.pad(self.cells.float(), padding)[None, None], longer)[0, 0] > 0
+        return OccupancyGrid(cells, self.lower, self.cell * longer)
 
     def occupied(self, position: Float[Tensor, "*batch 3"]) -> Bool[Tensor, " *batch"]:
         shape = torch.tensor(self.cells.shape, device=position.device)

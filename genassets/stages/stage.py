@@ -152,6 +152,7 @@ class Stage:
         pretrained: pretrained files without which the stage cannot run with a config, each with the
             setting (as for --set) that does without; a run checks them before its first stage.
         sharded: one output per log of the dataset instead of one over all.
+        on_request: an experiment gets it only by naming it among its stages.
     """
 
     name: str
@@ -167,3 +168,4 @@ class Stage:
     reads: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
     borrows: Callable[[Any], tuple[Borrowed, ...]] = field(default=_borrows_nothing)
     pretrained: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
+    on_request: bool = False

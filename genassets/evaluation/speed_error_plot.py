@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 
-def write_speed_error_plot(points: pd.DataFrame, path: Path) -> None:
-    """Draw every point of `evaluation.speed_error.measure`, with its columns pareto and knee, as a PNG.
+def speed_error_plot(points: pd.DataFrame) -> NDArray[np.uint8]:
+    """Every point of `evaluation.speed_error.measure`, with its columns pareto and knee, as an image (h, w, 3).
 
     Seconds run to the right, dB to the exact mode upwards: good is up and to the left. The exact mode itself has
     no error and is left out.
@@ -18,8 +19,8 @@ def write_speed_error_plot(points: pd.DataFrame, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 5.5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
     shown = points[points["psnr_to_exact"] < points["psnr_to_exact"].max()]
     for lever, part in shown.groupby("lever", sort=False):
@@ -51,4 +52,5 @@ def write_speed_error_plot(points: pd.DataFrame, path: Path) -> None:
     axes.set_ylabel("PSNR to the exact mode, dB")
     axes.grid(True, which="both", linewidth=0.3)
     axes.legend(fontsize=7, ncols=2)
-    figure.savefig(path, dpi=110)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
