@@ -79,8 +79,9 @@ def renderer(library: Path) -> SceneRenderer:
     return SceneRenderer.load(library)
 
 
+@pytest.mark.parametrize("paged", [False, True])
 def test_a_killed_and_resumed_training_equals_an_undisturbed_one(
-    prepared: Prepared, undisturbed: AssetModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    prepared: Prepared, undisturbed: AssetModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, paged: bool
 ) -> None:
     monkeypatch.setattr(training, "CURVE_EVERY", 1)
     steps = []
@@ -91,9 +92,9 @@ def test_a_killed_and_resumed_training_equals_an_undisturbed_one(
             raise Killed
 
     with pytest.raises(Killed):
-        prepared.train(tmp_path, curve=kill)
+        prepared.train(tmp_path, curve=kill, paged=paged)
     steps.clear()
-    resumed = prepared.train(tmp_path, curve=kill)
+    resumed = prepared.train(tmp_path, curve=kill, paged=paged)
     assert min(steps) == 5  # from the checkpoint of step 4, not from the start
     assert same_state(resumed, undisturbed)
 
@@ -157,12 +158,12 @@ def test_a_step_that_is_not_finite_changes_nothing(
     trainer.advance()
     trainer.advance()
     spoil(trainer.model)
-    before, after = tmp_path / "before.pt", tmp_path / "after.pt"
-    training.save_checkpoint(trainer, before)
+    training.save_checkpoint(trainer, tmp_path)
+    before = (tmp_path / "checkpoint.pt").read_bytes()
     with pytest.raises(StageError, match=message + r"\(log tiny, actors \[\d"):
         trainer.advance()
-    training.save_checkpoint(trainer, after)
-    assert after.read_bytes() == before.read_bytes()
+    training.save_checkpoint(trainer, tmp_path)
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
 
 
 def test_a_step_learns_from_the_decoded_actors_alone(prepared: Prepared) -> None:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
 
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.pages import Pages
 from genassets.reconstruction.settings import ModelSettings, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training import Trainer, build_model, train
-from genassets.reconstruction.training_data import TrainingLog
+from genassets.reconstruction.training_log import TrainingLog
 
 CAMERAS = ("front_camera", "front_left_camera")
 SETTINGS = ReconstructionSettings(
@@ -49,20 +50,28 @@ STRIDE = 2
 @dataclass(frozen=True)
 class Prepared:
     assets: pd.DataFrame
-    data: list[TrainingLog]
+    data: Sequence[TrainingLog]
 
-    def model(self, seed: int = 0) -> AssetModel:
-        return build_model(self.assets, ["tiny"], SETTINGS, seed)
+    def model(self, seed: int = 0, pages: Pages | None = None) -> AssetModel:
+        names = [log.scene.log_name for log in self.data]
+        if pages is None:
+            return build_model(self.assets, names, SETTINGS, seed)
+        return build_model(self.assets, names, SETTINGS, seed, pages.place)
 
-    def trainer(self, settings: ReconstructionSettings = SETTINGS) -> Trainer:
-        return Trainer(self.model(), self.data, settings, seed=0)
+    def trainer(self, settings: ReconstructionSettings = SETTINGS, pages: Pages | None = None) -> Trainer:
+        return Trainer(self.model(pages=pages), self.data, settings, 0, pages=pages)
 
     def train(
-        self, work_dir: Path, seed: int = 0, curve: Callable[[str, int, float], None] = lambda *_: None
+        self,
+        work_dir: Path,
+        seed: int = 0,
+        curve: Callable[[str, int, float], None] = lambda *_: None,
+        paged: bool = False,
     ) -> AssetModel:
         work_dir.mkdir(exist_ok=True)
-        model = self.model(seed)
-        train(model, self.data, SETTINGS, seed, work_dir, lambda *_: None, curve)
+        pages = Pages(work_dir / "pages.bin") if paged else None
+        model = self.model(seed, pages)
+        train(model, self.data, SETTINGS, seed, work_dir, lambda *_: None, curve, pages=pages)
         return model
 
 

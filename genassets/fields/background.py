@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -20,7 +22,14 @@ def contract(points: Float[Tensor, "samples 3"]) -> Float[Tensor, "samples 3"]:
 class BackgroundPlanes(nn.Module):
     """One log's learnable triplane, 1 x 3 x channels x resolution x resolution."""
 
-    def __init__(self, resolution: int, channels: int, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        resolution: int,
+        channels: int,
+        generator: torch.Generator,
+        place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+    ) -> None:
+        """place: where the planes are kept, as in AssetModel."""
         super().__init__()
         start = torch.randn(1, 3, channels, resolution, resolution, generator=generator)
-        self.planes = nn.Parameter(0.1 * start)
+        self.planes = nn.Parameter(place(0.1 * start))

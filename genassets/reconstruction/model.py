@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -43,7 +43,8 @@ class AssetModel(nn.Module):
 
     sizes (actors, 3) are l, w, h in metres; class_index (actors,) points into CLASSES. Initial values come
     from the seed alone. Without a decoder (settings.decoder) a code is an actor's three planes, and neither embeddings
-    nor variances are there: the paper's ablation.
+    nor variances are there: the paper's ablation. place: what keeps the planes of a log's background, as they are
+    made: in memory by default.
     """
 
     sizes: Tensor
@@ -51,7 +52,13 @@ class AssetModel(nn.Module):
     coarse_distance: Tensor
 
     def __init__(
-        self, settings: ModelSettings, sizes: Tensor, class_index: Tensor, logs: Sequence[str], seed: int
+        self,
+        settings: ModelSettings,
+        sizes: Tensor,
+        class_index: Tensor,
+        logs: Sequence[str],
+        seed: int,
+        place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
     ) -> None:
         super().__init__()
         self.settings = settings
@@ -104,7 +111,9 @@ class AssetModel(nn.Module):
         self.beta = Sharpness(settings.sharpness)
         self.background_beta = Sharpness()
         self.backgrounds = nn.ModuleList(
-            BackgroundPlanes(settings.background_resolution, settings.background_plane_channels, generator)
+            BackgroundPlanes(
+                settings.background_resolution, settings.background_plane_channels, generator, place
+            )
             for _ in logs
         )
         with torch.no_grad():
@@ -155,12 +164,13 @@ class AssetModel(nn.Module):
         self.coarse_distance[actor] = coarse_distance(fields, actor, self.settings.coarse_resolution)
 
     @torch.no_grad()
-    def refresh_coarse_distances(self) -> None:
-        """Coarse distance of every actor from its mean code, as the finished model uses it."""
+    def refresh_coarse_distances(self, then: Callable[[], None] = lambda: None) -> None:
+        """Coarse distance of every actor from its mean code, as the finished model uses it; `then` follows some."""
         for actors in torch.arange(len(self.sizes)).split(16):
             fields = self.actor_fields(actors, self.decode(actors, self.latents(actors).code))
             for actor in actors.tolist():
                 self.refresh_coarse_distance(actor, fields)
+            then()
 
     def actor_fields(
         self, actors: Int[Tensor, " n"], planes: Float[Tensor, "n 3 channels height width"]

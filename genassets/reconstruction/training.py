@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import add
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -24,6 +22,7 @@ from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
 from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
 from genassets.reconstruction.adversary import Adversary
+from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.lidar_surface import draw_surface_samples
 from genassets.reconstruction.losses import (
@@ -35,9 +34,11 @@ from genassets.reconstruction.losses import (
     total_variation,
 )
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.pages import Pages, completed, move_into, outside_pages
 from genassets.reconstruction.remembered_planes import RememberedPlanes
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
+from genassets.reconstruction.training_log import OPEN_LOGS
 from genassets.reconstruction.workers import Workers
 from genassets.rendering.rays import mirror_where, mirrored
 from genassets.rendering.renderer import (
@@ -101,7 +102,8 @@ class Trainer:
 
     That makes a run that was killed and resumed from a checkpoint equal to one that was not. Parameters that ask for
     no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw:
-    what a view of a step is made of.
+    what a view of a step is made of. With `pages`, codes, backgrounds and coarse distances lie there with their
+    optimisers' moments, and in memory only while they are used.
     """
 
     def __init__(
@@ -112,6 +114,7 @@ class Trainer:
         seed: int,
         pull: LatentPull | None = None,
         draw: Draw = draw_batch,
+        pages: Pages | None = None,
     ):
         self.model, self.data, self.settings, self.seed, self.pull = model, data, settings, seed, pull
         self._draw = draw
@@ -123,6 +126,10 @@ class Trainer:
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
         codes = {"params": model.codes(), "lr": rates.latent if model.decoder else rates.background}
         self.sparse = torch.optim.SparseAdam([codes], betas=(0.9, 0.99))
+        self.pages = pages
+        self._drawn: set[int] = set()  # logs since pages were released last
+        if pages is not None:
+            move_into(pages, model, self.dense, self.sparse)
         weights = settings.weights
         self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
         self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
@@ -162,6 +169,10 @@ class Trainer:
         if self.adversary is not None and "adversarial" in result.losses:
             self.adversary.learn(result.compared)
         self.step += 1
+        self._drawn.update(share.log for share in shares)
+        if self.pages is not None and len(self._drawn) > OPEN_LOGS:
+            self.pages.release()
+            self._drawn.clear()
         return result
 
     def _share(self, view: int) -> _Share:
@@ -316,26 +327,34 @@ class Trainer:
                 group["lr"] = rate * share
 
     def state(self) -> dict[str, Any]:
-        """Everything that the next steps depend on."""
+        """Everything that the next steps depend on, but what lies in pages."""
         return {
             "step": self.step,
             "refreshed": self.refreshed,
             "planes": self.planes.state(),
-            "model": self.model.state_dict(),
-            "dense": self.dense.state_dict(),
-            "sparse": self.sparse.state_dict(),
+            "model": outside_pages(self.model.state_dict(), self.pages),
+            "dense": outside_pages(self.dense.state_dict(), self.pages),
+            "sparse": outside_pages(self.sparse.state_dict(), self.pages),
             "adversary": None if self.adversary is None else self.adversary.state(),
             "pull": None if self.pull is None else self.pull.state(),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from a state."""
+        """Continue from a state; the pages have what they had then.
+
+        Raises:
+            RuntimeError, ValueError, KeyError: it is the state of another model.
+        """
         self.step = int(state["step"])
         self.refreshed = state["refreshed"]
         self.planes.restore(state["planes"])
-        self.model.load_state_dict(state["model"])
-        self.dense.load_state_dict(state["dense"])
-        self.sparse.load_state_dict(state["sparse"])
+        expected = outside_pages(self.model.state_dict(), self.pages).keys()
+        if expected != state["model"].keys():
+            raise KeyError(f"the model has {', '.join(expected ^ state['model'].keys())}")
+        self.model.load_state_dict(state["model"], strict=False)
+        for name, optimiser in (("dense", self.dense), ("sparse", self.sparse)):
+            # Moments in pages are taken over as they are: not copied, which would read all of them.
+            optimiser.load_state_dict(completed(state[name], optimiser.state_dict()))
         if self.adversary is not None:
             self.adversary.restore(state["adversary"])
         if self.pull is not None:
@@ -392,12 +411,16 @@ def _gradients(model: AssetModel) -> dict[str, list[Tensor]]:
 
 
 def build_model(
-    assets: pd.DataFrame, logs: Sequence[str], settings: ReconstructionSettings, seed: int
+    assets: pd.DataFrame,
+    logs: Sequence[str],
+    settings: ReconstructionSettings,
+    seed: int,
+    place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
 ) -> AssetModel:
-    """An untrained model for a table of assets."""
+    """An untrained model for a table of assets; `place` as in AssetModel."""
     sizes = torch.tensor(assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64))
     classes = torch.tensor([CLASSES.index(name) for name in assets["actor_class"]], dtype=torch.long)
-    return AssetModel(settings.model, sizes, classes, logs, seed)
+    return AssetModel(settings.model, sizes, classes, logs, seed, place)
 
 
 def train(
@@ -409,18 +432,11 @@ def train(
     progress: Progress,
     curve: Curve,
     pull: LatentPull | None = None,
+    pages: Pages | None = None,
 ) -> None:
     """Train the model in place, from the checkpoint in work_dir where there is one."""
-    trainer = Trainer(model, data, settings, seed, pull)
-    checkpoint = work_dir / "checkpoint.pt"
-    if checkpoint.exists():
-        try:
-            trainer.restore(torch.load(checkpoint, weights_only=True))
-        except (RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
-            raise StageError(
-                f"{checkpoint}: cannot be continued from ({error}); expected a checkpoint of this reconstruction. "
-                "Delete the file to train from the start."
-            ) from error
+    trainer = Trainer(model, data, settings, seed, pull, pages=pages)
+    restore_checkpoint(trainer, work_dir)
     while trainer.step < settings.steps:
         result = trainer.advance()
         step = trainer.step
@@ -433,15 +449,5 @@ def train(
                 curve(f"samples/{name}", step, count)
             progress(step, settings.steps, f"step {step}/{settings.steps}, patch PSNR {psnr:.1f} dB")
         if step % settings.checkpoint_every == 0 and step < settings.steps:
-            save_checkpoint(trainer, checkpoint)
-    model.refresh_coarse_distances()
-
-
-def save_checkpoint(trainer: Trainer, path: Path) -> None:
-    """Write a checkpoint whole or not at all."""
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        torch.save(trainer.state(), file)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+            save_checkpoint(trainer, work_dir)
+    model.refresh_coarse_distances(*([pages.release] if pages else []))

@@ -6,17 +6,18 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from genassets.driving import Log
 from genassets.errors import StageError
 from genassets.geometry.cameras import pixel_centres
-from genassets.reconstruction.lidar_surface import ActorReturns, actor_returns
+from genassets.reconstruction.lidar_surface import actor_returns
 from genassets.reconstruction.scene import (
     LidarSweepRays,
     SceneFrame,
@@ -28,9 +29,17 @@ from genassets.reconstruction.scene import (
     static_points,
 )
 from genassets.reconstruction.settings import ReconstructionSettings
+from genassets.reconstruction.training_log import (
+    ImageFiles,
+    Observation,
+    SweepFiles,
+    TrainingLog,
+    finish_prepared,
+    log_directory,
+    write_log,
+)
 from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import BOX_PADDING, Rays, cast_rays, concatenate_rays
-from genassets.rendering.sampling import OccupancyGrid
 
 logger = logging.getLogger(__name__)
 
@@ -47,28 +56,6 @@ FREE_BEFORE_RETURN = 0.1
 
 LIDAR_BEHIND = 2.0
 """Metres that a LiDAR ray is followed beyond its return: weight found there is an error to learn from."""
-
-
-@dataclass(frozen=True)
-class Observation:
-    """An actor in a training view: bounds x0, y0, x1, y1 in pixels of the rendered image."""
-
-    view: int
-    actor: int
-    bounds: tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class TrainingLog:
-    """One log's share of the training data."""
-
-    scene: SceneFrame
-    views: list[View]
-    images: list[UInt8[Tensor, "height width 3"]]
-    observations: list[Observation]
-    lidar: list[LidarSweepRays]
-    returns: Mapping[int, ActorReturns]
-    occupancy: OccupancyGrid
 
 
 @dataclass(frozen=True)
@@ -137,19 +124,23 @@ def prepare_training(
     is_training: Callable[[int], bool],
     settings: ReconstructionSettings,
     stride: int,
-) -> tuple[pd.DataFrame, list[TrainingLog]]:
+    directory: Path | None = None,
+) -> tuple[pd.DataFrame, Sequence[TrainingLog]]:
     """The table of learnable actors and, for each log, its views, sweeps and occupancy.
 
     An actor is learnable once it is observed: a training view shows it with at least `smallest_actor` pixels and
     nearer boxes don't hide it whole. Columns: log, actor_id, actor_class, size_l, size_w, size_h (metres),
     observations.
 
+    With a directory, each log is written there, an image and a sweep at a time, and read again as it is drawn from:
+    memory does not grow with logs. Without one, everything is kept.
+
     Raises:
         StageError: a log has no training image, or no training view shows any actor.
     """
     tables, prepared = [], []
     offset = 0
-    for log in logs:
+    for number, log in enumerate(logs):
         scene = scene_frame(log)
         everyone = {track.actor_id: number for number, track in enumerate(log.tracks)}
         shots = training_frames(log, cameras, is_training)
@@ -165,12 +156,17 @@ def prepare_training(
         number_of = np.full(len(log.tracks), -1, dtype=np.int64)
         number_of[np.flatnonzero(seen)] = list(index.values())
         observations = [
-            Observation(number, int(number_of[view.actors.index[row]]), tuple(view.bounds[row].tolist()))
-            for number, (view, rows) in enumerate(zip(views, observed, strict=True))
+            Observation(shown, int(number_of[view.actors.index[row]]), tuple(view.bounds[row].tolist()))
+            for shown, (view, rows) in enumerate(zip(views, observed, strict=True))
             for row in rows
         ]
         views = [_of_learnable(view, number_of) for view in views]
-        prepared.append(_training_log(log, views, observations, index, scene, settings, is_training))
+        own = None if directory is None else log_directory(directory, number)
+        data = _training_log(log, views, observations, index, scene, settings, is_training, own)
+        if own is None:
+            prepared.append(data)
+        else:
+            write_log(own, data)
         offset += len(table)
     assets = pd.concat(tables, ignore_index=True)
     if assets.empty:
@@ -180,7 +176,7 @@ def prepare_training(
             f"{settings.smallest_actor} pixels; expected tracked boxes in view of {', '.join(cameras)}. "
             "Choose other logs or cameras, a larger image_scale, or a smaller smallest_actor."
         )
-    return assets, prepared
+    return assets, prepared if directory is None else finish_prepared(directory, assets)
 
 
 def _asset_table(log: Log, learnable: np.ndarray, seen: np.ndarray) -> pd.DataFrame:
@@ -207,10 +203,21 @@ def _training_log(
     scene: SceneFrame,
     settings: ReconstructionSettings,
     is_training: Callable[[int], bool],
+    directory: Path | None,
 ) -> TrainingLog:
+    """A log's training data; images and sweeps go to files where there is a directory for them."""
     render, model = settings.rendering, settings.model
     frames = [frame for frame in range(log.frame_count) if is_training(frame) and log.has_sweep(frame)]
-    sweeps = [lidar_rays(log, f, index, scene, render.background_far, BOX_PADDING) for f in frames]
+    images = (torch.from_numpy(load_image(log, view)) for view in views)
+    rays = (lidar_rays(log, f, index, scene, render.background_far, BOX_PADDING) for f in frames)
+    sweeps = (sweep for sweep in rays if len(sweep.distance))
+    kept_images: Sequence[Tensor]
+    kept_sweeps: Sequence[LidarSweepRays]
+    if directory is None:
+        kept_images, kept_sweeps = list(images), list(sweeps)
+    else:
+        kept_images = ImageFiles.write(directory / "images", images)
+        kept_sweeps = SweepFiles.write(directory / "sweeps", sweeps)
     occupancy = background_occupancy(
         static_points(log, frames, scene, BOX_PADDING),
         render.occupancy_cell,
@@ -218,8 +225,8 @@ def _training_log(
         render.background_far + model.background_radius,
         2 * model.background_height,
     )
-    images = [torch.from_numpy(load_image(log, view)) for view in views]
-    return TrainingLog(scene, views, images, observations, sweeps, actor_returns(sweeps), occupancy)
+    returns = actor_returns(kept_sweeps)
+    return TrainingLog(scene, views, kept_images, observations, kept_sweeps, returns, occupancy)
 
 
 def _observed(view: View, smallest: int) -> list[int]:
@@ -272,7 +279,7 @@ def draw_batch(
     owner = np.array([o.view for o in data.observations], dtype=np.int64)
     of_view = np.bincount(owner, chance, minlength=len(data.views)) + 1e-9
     number = int(rng.choice(len(data.views), p=of_view / of_view.sum()))
-    view = data.views[number]
+    view, image = data.views[number], data.images[number]
     candidates = np.flatnonzero(owner == number)
     shadows = settings.model.shadow_hidden > 0
 
@@ -290,7 +297,7 @@ def draw_batch(
             patch_rays(view, column, row, settings.patch_size, settings.patch_margin, stride, shadows)
         )
         x, y, extent = column * stride, row * stride, settings.patch_size * stride
-        targets.append(data.images[number][y : y + extent, x : x + extent])
+        targets.append(image[y : y + extent, x : x + extent])
     pixels = torch.stack(targets).permute(0, 3, 1, 2).float() / 255
     object_patch = None
     compared = settings.weights.perceptual or settings.weights.adversarial
@@ -402,10 +409,9 @@ def _draw_lidar(
     data: TrainingLog, count: int, met: np.ndarray, rng: np.random.Generator
 ) -> tuple[list[Rays], Tensor]:
     """LiDAR rays of one sweep, most on actors that the batch decodes anyway."""
-    sweeps = [sweep for sweep in data.lidar if len(sweep.distance)]
-    if not count or not sweeps:
+    if not count or not len(data.lidar):
         return [], torch.zeros(0)
-    sweep = sweeps[int(rng.integers(len(sweeps)))]
+    sweep = data.lidar[int(rng.integers(len(data.lidar)))]
     groups = (
         (np.isin(sweep.actor, met), LIDAR_SHARE_ON_ACTORS),
         (np.isin(sweep.crossed, met), LIDAR_SHARE_THROUGH_ACTORS),

@@ -24,25 +24,32 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
     from genassets.reconstruction.actor_colour import with_colours
     from genassets.reconstruction.adaptation import adapted_model, unknown_classes
     from genassets.reconstruction.library import load_library, make_library, save_library
+    from genassets.reconstruction.pages import Pages
     from genassets.reconstruction.training import build_model, train
     from genassets.reconstruction.training_data import prepare_training
+    from genassets.reconstruction.training_log import PreparedLogs
     from genassets.stages.ingested import open_ingested
 
     logs = [open_ingested(path) for path in inputs.shards("ingest").values()]
     settings = ReconstructionSettings.model_validate(config.model_dump(exclude={"split", "adapt"}))
     split = config.split
     stride = 2**settings.model.rgb_upsamplings
-    assets, data = prepare_training(logs, split.train_cameras, split.is_training, settings, stride)
-    assets = with_colours(assets, data)
+    prepared = context.work_dir / "prepared"
+    if not PreparedLogs.exist(prepared):  # a run that was killed may have left them
+        prepare_training(logs, split.train_cameras, split.is_training, settings, stride, prepared)
+    data = PreparedLogs(prepared)
+    assets = with_colours(data.assets, data)
     names, counts = [log.name for log in logs], {"actors": len(assets)}
+    pages = Pages(context.work_dir / "pages.bin")
     if config.adapt is None:
-        model = build_model(assets, names, settings, context.seed)
+        model = build_model(assets, names, settings, context.seed, pages.place)
     else:
         library = load_library(inputs.borrowed["reconstruct"])
         model = adapted_model(library, assets, names, settings, config.adapt.start, context.seed)
         unknown = assets["actor_class"].isin(unknown_classes(library.assets, assets))
         counts["actors_of_classes_that_the_library_lacks"] = int(unknown.sum())
-    train(model, data, settings, context.seed, context.work_dir, context.progress, context.curve)
+    progress, curve = context.progress, context.curve
+    train(model, data, settings, context.seed, context.work_dir, progress, curve, pages=pages)
     scenes, occupancy = [d.scene for d in data], [d.occupancy for d in data]
     save_library(make_library(assets, model, settings, scenes, occupancy), out)
     counts["views"] = sum(len(d.views) for d in data)
