@@ -70,7 +70,7 @@ def test_commands_are_handed_on_with_their_arguments(checkout: Path) -> None:
     assert call(checkout, "bench", "--json").stdout == "genassets bench --json\n"
     demo = call(checkout, "demo", "--set", "seed=1").stdout.splitlines()
     assert demo == [
-        "genassets weights fetch --quiet sam-encoder sam-decoder lpips-alexnet",
+        "genassets weights fetch --quiet sam-encoder sam-decoder lpips-alexnet inception",
         "genassets run demo --set seed=1",
     ]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -71,8 +72,9 @@ class Pages:
 
     def copy_to(self, path: Path) -> None:
         """Write the tensors as they are now to another file, and wait until the disk has it."""
-        with path.open("wb") as copy:
-            _copy(self._file.fileno(), copy.fileno())
+        with self._path.open("rb") as own, path.open("wb") as copy:
+            shutil.copyfileobj(own, copy)
+            copy.flush()
             os.fsync(copy.fileno())
 
     def restore(self, path: Path) -> None:
@@ -84,8 +86,8 @@ class Pages:
         expected, found = self._path.stat().st_size, path.stat().st_size
         if found != expected:
             raise ValueError(f"{path} has {found} bytes, expected {expected}")
-        with path.open("rb") as copy:
-            _copy(copy.fileno(), self._file.fileno())
+        with path.open("rb") as copy, self._path.open("r+b") as own:
+            shutil.copyfileobj(copy, own)
 
 
 def move_into(
@@ -122,10 +124,3 @@ def completed(tree: dict[Any, Any], own: dict[Any, Any]) -> dict[Any, Any]:
         key: completed(value, own.get(key, {})) if isinstance(value, dict) else value
         for key, value in tree.items()
     }
-
-
-def _copy(source: int, target: int) -> None:
-    """A whole file's bytes by the kernel, with nothing of them in this process's memory."""
-    at, size = 0, os.fstat(source).st_size
-    while at < size:
-        at += os.copy_file_range(source, target, size - at, at, at)
