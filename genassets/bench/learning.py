@@ -24,7 +24,7 @@ UNSEEN = 8
 SECONDS, TARGET = 60, 25.0
 """The aim: unseen views of so many dB after so many seconds of training."""
 
-STEPS = 480
+STEPS = 320
 LOOKS = 6
 """Evaluations, evenly spread over the steps; their time does not count."""
 
@@ -43,10 +43,10 @@ def settings(steps: int) -> ReconstructionSettings:
         image_scale=1.0,
         steps=steps,
         views=2,
-        patches=8,
+        patches=16,
         patch_size=16,
         patch_margin=0,
-        decoded_actors=2,
+        decoded_actors=4,
         lidar_rays=0,
         surface_samples=0,
         mirror_share=0.5,
@@ -61,11 +61,10 @@ def settings(steps: int) -> ReconstructionSettings:
             rgb_channels=16,
             rgb_blocks=1,
             rgb_upsamplings=0,
-            coarse_resolution=16,
             shadow_hidden=0,
         ),
         rendering=RenderingSettings(
-            actor_step=0.15, background_step=60.0, background_far=50.0, sky_samples=1, coarse_refresh=4
+            actor_step=0.15, background_step=60.0, background_far=50.0, sky_samples=1
         ),
     )
 

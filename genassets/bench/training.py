@@ -17,12 +17,12 @@ LOOKS = 3
 
 LEVERS: Mapping[str, Mapping[str, Any]] = {
     "as in `learning`": {},
-    "decoded_actors 1": {"decoded_actors": 1},
-    "decoded_actors 4": {"decoded_actors": 4},
-    "patches 4": {"patches": 4},
-    "patches 16": {"patches": 16},
+    "decoded_actors 2": {"decoded_actors": 2},
+    "decoded_actors 8": {"decoded_actors": 8},
+    "patches 8": {"patches": 8},
+    "patches 32": {"patches": 32},
     "views 1": {"views": 1},
-    "views 4": {"views": 4},
+    "views of half the size": {"patches": 8, "decoded_actors": 2},
     "no shallow path": {"model": {"decoder_patch_channels": 0}},
     "surface term from 64 points a car": {"surface_samples": 64},
     "no total variation": {"weights": {"total_variation": 0.0}},
