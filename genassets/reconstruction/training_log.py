@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import functools
 import json
+from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
@@ -96,11 +97,11 @@ class _Files(Sequence[_T]):
     def _path(self, number: int) -> Path:
         return self._directory / f"{number:05}{self.suffix}"
 
-    def _write(self, path: Path, thing: _T) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def _write(self, path: Path, thing: _T) -> None: ...
 
-    def _read(self, path: Path) -> _T:
-        raise NotImplementedError
+    @abstractmethod
+    def _read(self, path: Path) -> _T: ...
 
 
 class ImageFiles(_Files[Tensor]):
