@@ -85,7 +85,7 @@ def _seen_by(
             cv2.remap(image, c[:, None], r[:, None], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
             for c, r in zip(_split(columns), _split(rows), strict=True)
         ]
-        return np.concatenate(found)[:, 0]
+        return np.concatenate(found)[:, 0].astype(np.float32)
 
     alpha = sampled(np.ascontiguousarray(view.image.alpha, dtype=np.float32))
     rgb = sampled(np.ascontiguousarray(view.image.rgb, dtype=np.float32))
@@ -114,7 +114,9 @@ class MeshAgreement:
     silhouette_iou: float
 
 
-def agreement(mesh: SurfaceMesh, colours: NDArray[np.float32], views: Sequence[SurroundView]) -> MeshAgreement:
+def agreement(
+    mesh: SurfaceMesh, colours: NDArray[np.float32], views: Sequence[SurroundView]
+) -> MeshAgreement:
     """Compare a mesh with vertex colours (V, 3) with renders that did not colour it, all pixels together."""
     scene = ray_scene(mesh)
     squares, pixels, both, either = 0.0, 0, 0, 0

@@ -17,6 +17,8 @@ LEVEL = 0.03
 """Metres; the field's distance at which the mesh lies. docs/export.md has what other levels gain and lose."""
 SMOOTHING = 0.7
 """Grid points; standard deviation of the Gaussian."""
+CLEAR_OF_GRID = 1e-4
+"""Metres."""
 ROAD = 0.08
 """Metres above the ground up to which a plate without anything on it is road."""
 
@@ -62,8 +64,8 @@ def _body(grid: DistanceGrid, size: ArrayLike, resolution: int, name: str) -> Bo
     if mesh is None:
         raise StageError(
             f"{name}: no surface, for its signed distance never crosses zero (from {sdf.min():.3f} to "
-            f"{sdf.max():.3f} m on {resolution}^3 points); expected a closed body. It may be too thin for the grid: raise "
-            "the resolution; or it was hardly seen: train longer, or leave it out."
+            f"{sdf.max():.3f} m on {resolution}^3 points); expected a closed body. It may be too thin for the grid: "
+            "raise the resolution; or it was hardly seen: train longer, or leave it out."
         )
     return without_fragments(mesh, resolution)
 
@@ -73,8 +75,8 @@ def visible_distance(
 ) -> NDArray[np.float32]:
     """The distance (R, R, R) whose zero is the surface that renders show, within the box of size (3,) in metres.
 
-    Renders are soft: `LEVEL` outside the zero of the field they are still dark, and thin parts that never reach zero are
-    seen. Ridges of the planes' texels are smoothed, and the road that a field learned under an actor is cut off.
+    Renders are soft: `LEVEL` outside the zero of the field they are still opaque, and thin parts that never reach zero
+    are seen. Ridges of the planes' texels are smoothed, and the road that a field learned under an actor is cut off.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -83,8 +85,12 @@ def visible_distance(
     axes = [np.abs(lower[k] + spacing[k] * np.arange(sdf.shape[k])) - half[k] for k in range(3)]
     outside = np.maximum(np.maximum(axes[0][:, None, None], axes[1][None, :, None]), axes[2][None, None, :])
     distance = np.maximum(grown, outside)
+    # A surface through a grid point itself gives marching cubes triangles without area, which tear the mesh.
+    distance = np.where(np.abs(distance) < CLEAR_OF_GRID, CLEAR_OF_GRID, distance)
     heights = lower[2] + spacing[2] * np.arange(sdf.shape[2]) + half[2]
-    return _without_road(distance, int(np.searchsorted(heights, ROAD)), float(spacing.max())).astype(np.float32)
+    return _without_road(distance, int(np.searchsorted(heights, ROAD)), float(spacing.max())).astype(
+        np.float32
+    )
 
 
 def _without_road(distance: NDArray[np.float64], above: int, clear: float) -> NDArray[np.float64]:

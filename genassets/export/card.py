@@ -26,8 +26,8 @@ class Licence:
 LICENCES: Mapping[str, Licence] = {
     "pandaset": Licence(
         "CC BY 4.0 with the PandaSet Dataset Terms of Use",
-        "Data derived from PandaSet stay under its terms: give credit, say what was changed, do not identify persons, use "
-        "no name or mark of the licensors beyond the credit. The terms prevail over CC BY 4.0 where they differ.",
+        "Data derived from PandaSet stay under its terms: give credit, say what was changed, do not identify persons, "
+        "use no name or mark of the licensors beyond the credit. The terms prevail over CC BY 4.0 where they differ.",
         "https://creativecommons.org/licenses/by/4.0/",
         "PandaSet by Hesai and Scale AI (pandaset.org); reconstructed by genassets from camera images and LiDAR",
     ),
@@ -91,8 +91,9 @@ class MeshFacts:
 class Subject:
     """What is known of an actor before it is exported.
 
-    origin: reconstructed or generated. source: kind of its log, as ingest's log.json has it. size: length, width, height
-    of its box in metres. metrics: the run's measures of it, by name. library: SHA-256 of the library's codes and weights.
+    origin: reconstructed or generated. source: kind of its log, as ingest's log.json has it. size: length, width,
+    height of its box in metres. metrics: the run's measures of it, by name. library: SHA-256 of the library's codes and
+    weights.
     """
 
     name: str

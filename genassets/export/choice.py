@@ -22,7 +22,7 @@ def spread_over_classes(assets: pd.DataFrame, count: int) -> list[int]:
 
 
 def folder_names(assets: pd.DataFrame) -> list[str]:
-    """A name for each row that any file system takes: class, log, and the actor's id or the start that tells it apart."""
+    """A name for each row that any file system takes: class, log, and the actor's id or the start that is enough."""
     ids = [str(actor) for actor in assets["actor_id"]]
     short = _told_apart([f"{log} {actor[:8]}" for log, actor in zip(assets["log"], ids, strict=True)])
     names = [

@@ -33,7 +33,12 @@ def linear_from_srgb(colours: NDArray) -> NDArray[np.float32]:
 
 
 def write_glb(
-    path: Path, body: Body, colours: NDArray[np.float32], size: ArrayLike, name: str, extras: Mapping[str, Any]
+    path: Path,
+    body: Body,
+    colours: NDArray[np.float32],
+    size: ArrayLike,
+    name: str,
+    extras: Mapping[str, Any],
 ) -> None:
     """Write a body with sRGB vertex colours (V, 3); `extras` go with the scene and into the mesh's own.
 
@@ -64,9 +69,7 @@ def write_glb(
             attributes["COLOR_0"] = attributes.pop(COLOUR)
         tree["asset"]["generator"] = "genassets"
 
-    path.write_bytes(
-        trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=named)
-    )
+    path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=named))
 
 
 def write_ply(path: Path, body: Body, colours: NDArray[np.float32], size: ArrayLike) -> None:

@@ -58,7 +58,7 @@ def filled_region(
     """The part x0, y0, x1, y1 of an image that a box fills, with a margin; three fifths of a square one of a car."""
     pixels = project(intrinsics, transform_points(invert_pose(box_from_camera), box_corners(np.eye(4), size)))
     low = np.maximum(np.floor(pixels.min(axis=0)) - MARGIN_PX, 0).astype(int)
-    high = np.minimum(
-        np.ceil(pixels.max(axis=0)) + MARGIN_PX, [intrinsics.width, intrinsics.height]
-    ).astype(int)
+    high = np.minimum(np.ceil(pixels.max(axis=0)) + MARGIN_PX, [intrinsics.width, intrinsics.height]).astype(
+        int
+    )
     return int(low[0]), int(low[1]), int(high[0]), int(high[1])

@@ -86,7 +86,7 @@
       for (const [name, value] of Object.entries({
         "src": source, "alt": `${card.actor_class}, ${metres(card.size)}`, "camera-controls": "", "auto-rotate": "",
         "camera-orbit": "35deg 72deg auto", "shadow-intensity": "0.6", "shadow-softness": "0.9",
-        "interaction-prompt": "none", "tone-mapping": "neutral", "environment-image": "neutral", "exposure": "1.1",
+        "interaction-prompt": "none", "tone-mapping": "neutral", "environment-image": "neutral", "exposure": "1",
         "min-camera-orbit": "auto 0deg auto", "touch-action": "pan-y",
       })) viewer.setAttribute(name, value);
       viewer.addEventListener("load", () => {

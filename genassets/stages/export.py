@@ -1,6 +1,6 @@
 """Export actors of the run's libraries as folders that people can take away: GLB, PLY, turntables, cards.
 
-Writes actors/<name>/, actors.parquet (a row an exported actor) and skipped.parquet (a row an actor that has no surface).
+Writes actors/<name>/, actors.parquet (a row an exported actor) and skipped.parquet (a row an actor without surface).
 docs/export.md describes the files.
 """
 
@@ -39,19 +39,26 @@ class ExportConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     actors: int = Field(
-        12, ge=1, description="Actors of each library: the most observed of each class, then the next of each."
+        12,
+        ge=1,
+        description="Actors of each library: the most observed of each class, then the next of each.",
     )
     formats: tuple[Format, ...] = Field(
         ("glb", "ply", "gif", "png"), description="Files of each actor beside its card and thumbnail."
     )
     resolution: int = Field(
-        72, ge=16, le=256, description="Points along each side of the padded box at which distances are taken."
+        72,
+        ge=16,
+        le=256,
+        description="Points along each side of the padded box at which distances are taken.",
     )
     most_triangles: int = Field(
-        80_000, ge=1_000, description="Triangles of a mesh at most; a coarser grid is taken where it has more."
+        80_000,
+        ge=1_000,
+        description="Triangles of a mesh at most; a coarser grid is taken where it has more.",
     )
     view_resolution: int = Field(
-        192, ge=48, le=1024, description="Pixels a side of the views that colour the mesh and turn."
+        160, ge=48, le=1024, description="Pixels a side of the views that colour the mesh and turn."
     )
     turn_steps: int = Field(24, ge=8, le=120, description="Pictures of a whole turn, a multiple of eight.")
 
@@ -89,7 +96,10 @@ def run(inputs: Inputs, config: ExportConfig, out: Path, context: StageContext) 
     pictures = PictureList(out)
     if sheet := _contact_sheet(out, cards):
         pictures.add(
-            "actors", sheet[0], "Exported actors", f"{sheet[1]}. The gallery turns them in 3D; docs/export.md."
+            "actors",
+            sheet[0],
+            "Exported actors",
+            f"{sheet[1]}. The gallery turns them in 3D; docs/export.md.",
         )
     pictures.write()
     return _metrics(cards, len(skipped))
@@ -132,7 +142,9 @@ def export_libraries(
         try:
             cards.append(export_actor(source, subject, settings, out / "actors" / subject.name))
         except StageError as error:
-            skipped.append({**{name: getattr(subject, name) for name in SKIPPED_COLUMNS[:-1]}, "reason": str(error)})
+            skipped.append(
+                {**{name: getattr(subject, name) for name in SKIPPED_COLUMNS[:-1]}, "reason": str(error)}
+            )
     progress(len(todo), len(todo), "")
     out.mkdir(parents=True, exist_ok=True)
     pd.DataFrame([_row(card) for card in cards], columns=list(ROW_TYPES)).astype(ROW_TYPES).to_parquet(
@@ -241,7 +253,9 @@ def _subjects(
                 observed=log.observed.get(key[1]) if log and not made else None,
                 metrics={} if made else measured.get(key, {}),
                 nearest=Nearest(
-                    str(asset.get("nearest_log", key[0])), nearest, None if distance is None else float(distance)
+                    str(asset.get("nearest_log", key[0])),
+                    nearest,
+                    None if distance is None else float(distance),
                 )
                 if isinstance(nearest, str)
                 else None,
