@@ -18,6 +18,7 @@ from genassets.cli import weights
 from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
+from genassets.cli.export import export
 from genassets.cli.hard_cases import hard_cases
 from genassets.cli.inspect import inspect
 from genassets.cli.list import list_runs
@@ -72,6 +73,7 @@ app.command("status")(status)
 app.command("explain")(explain)
 app.command("resume")(resume)
 app.command("report")(report)
+app.command("export")(export)
 app.command("table")(table)
 app.command("list")(list_runs)
 app.command("verify")(verify)

@@ -10,6 +10,7 @@ from genassets.stages import (
     evaluate_reconstruction,
     evaluate_speed_error,
     evaluate_turns,
+    export,
     filter_occlusion,
     ingest,
     prepare_masks,
@@ -26,6 +27,7 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_reconstruction.STAGE,
     evaluate_turns.STAGE,
     turntables.STAGE,
+    export.STAGE,
     evaluate_speed_error.STAGE,
 )
 

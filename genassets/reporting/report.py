@@ -14,12 +14,15 @@ from typing import Any
 
 from genassets.pipeline.run_record import METRICS_FILE, SPEC_FILE, RunRecord, StepRecord, read_metrics
 from genassets.pipeline.store import CURVES, MANIFEST, PICTURES
+from genassets.reporting.gallery import GALLERY_PAGE, GalleryTitle, write_gallery
 from genassets.reporting.metric_tables import MetricTable, stage_tables
 
 REPORT_FOLDER = "report"
 PAGE = "index.html"
 TEMPLATE = "report.html.j2"
 STYLE = "report.css"
+GALLERY_FOLDER = "gallery"
+EXPORT_STAGE = "export"
 PACKAGES = (
     "genassets",
     "torch",
@@ -109,6 +112,7 @@ def write_report(run_dir: Path) -> Path:
         headlines=_headlines(metrics),
         lines=_stage_lines(record),
         sections=_sections(record, metrics, partial),
+        gallery=_gallery(record, partial),
         missing=[step.path for step in record.stages if step.path and not Path(step.path).is_dir()],
         spec=_spec_text(run_dir),
         machine=_machine(),
@@ -210,6 +214,16 @@ def _pictures(step: StepRecord, folder: Path) -> list[Picture]:
 
 def _file_name(step: StepRecord) -> str:
     return step.name if step.shard is None else f"{step.name}-{step.shard}"
+
+
+def _gallery(record: RunRecord, folder: Path) -> str | None:
+    """The gallery of what the run exported, relative to the page; None where it exported nothing."""
+    for step in record.stages:
+        if step.name == EXPORT_STAGE and step.path and (Path(step.path) / "actors").is_dir():
+            title = GalleryTitle(record.experiment, record.run_id, f"../{PAGE}#{EXPORT_STAGE}")
+            write_gallery(Path(step.path), folder / GALLERY_FOLDER, title)
+            return f"{GALLERY_FOLDER}/{GALLERY_PAGE}"
+    return None
 
 
 def _headlines(metrics: list[dict[str, Any]]) -> list[Headline]:
