@@ -16,7 +16,8 @@ from genassets.driving import Log
 from genassets.reconstruction.settings import ReconstructionSettings
 from genassets.reconstruction.training import Trainer, build_model, render_settings
 from genassets.reconstruction.training_data import region_rays
-from genassets.rendering.renderer import cull, render_rays
+from genassets.rendering.culling import cull
+from genassets.rendering.renderer import render_rays
 
 
 @pytest.fixture(scope="module")

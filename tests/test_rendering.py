@@ -12,17 +12,12 @@ import torch
 from genassets.fields.feature_field import FeatureField
 from genassets.geometry.transforms import yaw_pose
 from genassets.rendering.compositing import accumulate, depth_order, render_weights
+from genassets.rendering.culling import CoarseActors, cull
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
 from genassets.rendering.occupancy import background_occupancy, coarse_distance, prior_distance
 from genassets.rendering.rays import BOX_PADDING, Footprints, Hits, Rays, cast_rays, concatenate_rays
-from genassets.rendering.renderer import (
-    ActorFields,
-    BackgroundFields,
-    CoarseActors,
-    RenderSettings,
-    SampleCounts,
-    cull,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import SampleCounts, render_rays
 from genassets.rendering.rgb_network import RgbNetwork
 from genassets.rendering.sampling import sample_actors, sample_background, step_edges
 

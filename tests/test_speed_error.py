@@ -33,7 +33,7 @@ from genassets.pipeline.run_record import RunRecord, StepRecord
 from genassets.reconstruction.library import AssetLibrary, make_library
 from genassets.reconstruction.scene_renderer import SceneRenderer
 from genassets.reconstruction.training import render_settings
-from genassets.rendering.renderer import NEGLIGIBLE
+from genassets.rendering.render_settings import NEGLIGIBLE
 from genassets.rendering.sampling import OccupancyGrid
 
 POINTS = pd.DataFrame(

@@ -179,7 +179,8 @@ def show(model: AssetModel, task: CarTask, settings: ReconstructionSettings) -> 
 
     from genassets.reconstruction.training import render_settings
     from genassets.reconstruction.training_data import region_rays
-    from genassets.rendering.renderer import cull, render_rays
+    from genassets.rendering.culling import cull
+    from genassets.rendering.renderer import render_rays
 
     rendering = render_settings(settings.rendering)
     stride, context = model.stride, model.rgb.reach

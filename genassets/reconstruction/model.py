@@ -17,8 +17,9 @@ from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import Sharpness
 from genassets.fields.shadow import ShadowHead
 from genassets.reconstruction.settings import ModelSettings
+from genassets.rendering.culling import CoarseActors
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
 from genassets.rendering.occupancy import coarse_distance, prior_distance
-from genassets.rendering.renderer import ActorFields, BackgroundFields, CoarseActors
 from genassets.rendering.rgb_network import RgbNetwork
 from genassets.rendering.sampling import OccupancyGrid
 

@@ -40,15 +40,11 @@ from genassets.reconstruction.settings import LearningRates, ReconstructionSetti
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
 from genassets.reconstruction.training_log import OPEN_LOGS
 from genassets.reconstruction.workers import Workers
+from genassets.rendering.culling import cull
+from genassets.rendering.evaluation import ActorFields, actor_distance
 from genassets.rendering.rays import mirror_where, mirrored
-from genassets.rendering.renderer import (
-    ActorFields,
-    RenderSettings,
-    SampleCounts,
-    actor_distance,
-    cull,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import SampleCounts, render_rays
 from genassets.weights import load_lpips_arrays
 
 PERCEPTUAL_FILE = "lpips-vgg16"

@@ -10,7 +10,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from genassets.fields.shape_prior import bounded_distance
-from genassets.rendering.renderer import ActorFields, actor_distance, padded_half_size
+from genassets.rendering.evaluation import ActorFields, actor_distance, padded_half_size
 from genassets.rendering.sampling import OccupancyGrid
 
 
