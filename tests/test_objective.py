@@ -52,10 +52,12 @@ def test_mirrored_rays_meet_the_mirrored_scene() -> None:
 def test_only_vehicles_are_mirrored_and_only_in_training(prepared: Prepared) -> None:
     trainer = prepared.trainer(changed(SETTINGS, mirror_share=1.0))
     vehicles = prepared.assets["actor_class"].isin(["Car", "Truck", "Bus"]).to_numpy()
-    assert trainer.symmetric.numpy()[vehicles].all()
-    assert not trainer.symmetric.numpy()[(prepared.assets["actor_class"] == "Pedestrian").to_numpy()].any()
-    assert torch.equal(trainer._mirrored_actors(torch.Generator()), trainer.symmetric)
-    assert not trainer._mirrored_actors(None).any()
+    assert trainer.objective.symmetric.numpy()[vehicles].all()
+    assert not trainer.objective.symmetric.numpy()[
+        (prepared.assets["actor_class"] == "Pedestrian").to_numpy()
+    ].any()
+    assert torch.equal(trainer.objective._mirrored_actors(torch.Generator()), trainer.objective.symmetric)
+    assert not trainer.objective._mirrored_actors(None).any()
 
 
 def test_hinge_losses_in_closed_form() -> None:
@@ -123,7 +125,7 @@ def test_training_with_the_full_objective_resumes_to_the_same_numbers(
 def compared(trainer: Trainer, settings: ReconstructionSettings) -> list[tuple[torch.Tensor, torch.Tensor]]:
     batch = draw_batch(trainer.data[0], settings, STRIDE, np.random.default_rng(2))
     with torch.no_grad():
-        return trainer.losses(0, batch, None)[0].compared
+        return trainer.objective.losses(0, batch, None)[0].compared
 
 
 def test_an_object_patch_is_the_actors_box_resized(prepared: Prepared) -> None:
@@ -148,7 +150,7 @@ def test_an_object_patch_is_the_actors_box_resized(prepared: Prepared) -> None:
 
 def test_without_their_weights_no_object_patch_is_rendered(prepared: Prepared) -> None:
     trainer = prepared.trainer()
-    assert trainer.perceptual is None
+    assert trainer.objective.perceptual is None
     assert trainer.adversary is None
     assert draw_batch(prepared.data[0], SETTINGS, STRIDE, np.random.default_rng(2)).object_patch is None
 
@@ -160,7 +162,7 @@ def test_carving_is_what_is_seen_before_the_returns(prepared: Prepared) -> None:
     def carving(shift: float) -> float:
         moved = dataclasses.replace(batch, lidar_distance=batch.lidar_distance + shift)
         with torch.no_grad():
-            return trainer.losses(0, moved, None)[0].losses["carving"].item()
+            return trainer.objective.losses(0, moved, None)[0].losses["carving"].item()
 
     assert carving(-1000.0) == 0
     assert 0 < carving(0.0) < carving(1000.0) <= 1

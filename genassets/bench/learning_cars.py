@@ -177,7 +177,7 @@ def show(model: AssetModel, task: CarTask, settings: ReconstructionSettings) -> 
     """The unseen views as the model shows them, from mean codes: (n, size, size, 3) in [0, 1]."""
     import torch
 
-    from genassets.reconstruction.training import render_settings
+    from genassets.reconstruction.objective import render_settings
     from genassets.reconstruction.training_data import region_rays
     from genassets.rendering.culling import cull
     from genassets.rendering.renderer import render_rays

@@ -20,8 +20,8 @@ from genassets.driving import Log
 from genassets.geometry.cameras import Intrinsics, pixel_centres, pixel_directions
 from genassets.geometry.transforms import transform_directions
 from genassets.reconstruction.library import AssetLibrary, load_library
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.scene import View, make_view, rendered_intrinsics
-from genassets.reconstruction.training import render_settings
 from genassets.reconstruction.training_data import region_rays
 from genassets.rendering.culling import cull
 from genassets.rendering.evaluation import ActorFields, actor_distance, padded_half_size
