@@ -18,6 +18,7 @@ from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
 from genassets.errors import StageError
+from genassets.fields.row_blocks import Place, in_memory
 from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
@@ -272,7 +273,7 @@ def build_model(
     logs: Sequence[str],
     settings: ReconstructionSettings,
     seed: int,
-    place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+    place: Place = in_memory,
 ) -> AssetModel:
     """An untrained model for a table of assets; `place` as in AssetModel."""
     sizes = torch.tensor(assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64))
