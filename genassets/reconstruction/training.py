@@ -25,7 +25,7 @@ from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.objective import Objective, StepResult
 from genassets.reconstruction.pages import Pages, completed, move_into, outside_pages
-from genassets.reconstruction.remembered_planes import RememberedPlanes
+from genassets.reconstruction.remembered_planes import LIMIT, RememberedPlanes
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings
 from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
 from genassets.reconstruction.training_log import OPEN_LOGS
@@ -80,7 +80,8 @@ class Trainer:
         codes = {"params": model.codes(), "lr": rates.latent if model.decoder else rates.background}
         self.sparse = torch.optim.SparseAdam([codes], betas=(0.9, 0.99))
         self.pages = pages
-        self._drawn: set[int] = set()  # logs since pages were released last
+        self._drawn: set[int] = set()  # logs since pages were released last, and actors
+        self._met: set[int] = set()
         if pages is not None:
             move_into(pages, model, self.dense, self.sparse)
         self.adversary = Adversary(rates.discriminator, seed) if settings.weights.adversarial else None
@@ -120,9 +121,11 @@ class Trainer:
             self.adversary.learn(result.compared)
         self.step += 1
         self._drawn.update(share.log for share in shares)
-        if self.pages is not None and len(self._drawn) > OPEN_LOGS:
+        self._met |= result.counts.actors_met
+        if self.pages is not None and (len(self._drawn) > OPEN_LOGS or len(self._met) > LIMIT):
             self.pages.release()
             self._drawn.clear()
+            self._met.clear()
         return result
 
     def _share(self, view: int) -> _Share:
