@@ -160,7 +160,7 @@ class AssetModel(nn.Module):
         """Triplanes of some actors from their codes and their classes' embeddings."""
         if self.decoder is None or self.class_embedding is None:
             return code.reshape(len(code), 3, self.settings.plane_channels, *code.shape[-2:])
-        return self.decoder(code, self.class_embedding[self.class_index[actors]])
+        return self.decoder(code, self.class_embedding[self.class_index[actors]]).to(code.dtype)
 
     def coarse_actors(self) -> CoarseActors:
         """What culls samples and actors before anything is decoded."""

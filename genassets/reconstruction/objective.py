@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -23,14 +24,17 @@ from genassets.reconstruction.losses import (
     total_variation,
 )
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.processes import on_device
 from genassets.reconstruction.remembered_planes import RememberedPlanes
 from genassets.reconstruction.settings import ReconstructionSettings, RenderingSettings
 from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog
+from genassets.reconstruction.training_log import OPEN_LOGS
 from genassets.rendering.culling import cull
 from genassets.rendering.evaluation import ActorFields, actor_distance
 from genassets.rendering.rays import mirror_where, mirrored
 from genassets.rendering.render_settings import RenderSettings
 from genassets.rendering.renderer import SampleCounts, render_rays
+from genassets.rendering.sampling import OccupancyGrid
 from genassets.weights import load_lpips_arrays
 
 PERCEPTUAL_FILE = "lpips-vgg16"
@@ -47,6 +51,12 @@ class StepResult:
     bystanders: Tensor
     counts: SampleCounts
     compared: list[tuple[Tensor, Tensor]]
+
+    def detached(self) -> StepResult:
+        """The same without the way back to the parameters."""
+        losses = {term: value.detach() for term, value in self.losses.items()}
+        compared = [(shown.detach(), observed) for shown, observed in self.compared]
+        return replace(self, losses=losses, compared=compared)
 
 
 def render_settings(settings: RenderingSettings) -> RenderSettings:
@@ -77,9 +87,13 @@ class Objective:
         planes: RememberedPlanes,
     ) -> None:
         self.model, self.data, self.settings, self.planes = model, data, settings, planes
-        perceptual = settings.weights.perceptual
-        self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if perceptual else None
-        self.symmetric = torch.tensor([CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()])
+        self._device = model.sizes.device
+        self.perceptual = None
+        if settings.weights.perceptual:
+            self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16").to(self._device)
+        symmetric = [CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()]
+        self.symmetric = torch.tensor(symmetric, device=self._device)
+        self._occupancy_there = functools.lru_cache(OPEN_LOGS)(self._send_occupancy)
 
     def losses(
         self,
@@ -103,9 +117,9 @@ class Objective:
         decoded = model.decode(actors, latents.code)
         planes = torch.cat((decoded, self.planes.of(model, bystanders))) if len(bystanders) else decoded
         fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
-        background = model.background_fields(number, self.data[number].occupancy)
+        background = model.background_fields(number, self._occupancy(number))
         lidar = slice(batch.camera_rays, None)
-        free_until = torch.zeros(len(rays))
+        free_until = torch.zeros(len(rays), device=self._device)
         free_until[lidar] = batch.lidar_distance - FREE_BEFORE_RETURN
         rendered = render_rays(rays, culled, fields, background, rendering, generator, free_until)
         patch_rays = batch.patches * batch.side**2
@@ -121,6 +135,7 @@ class Objective:
             losses["carving"] = rendered.in_free_space[lidar].mean()
         count = settings.surface_samples if settings.weights.surface else 0
         samples = draw_surface_samples(self.data[number].returns, actors, count, generator)
+        samples = on_device(samples, self._device)
         if len(samples.position):
             position = mirror_where(samples.position, swapped[samples.actor])
             sdf, _ = actor_distance(position, samples.actor, fields)
@@ -157,9 +172,8 @@ class Objective:
         """Which actors of the library this view learns left for right."""
         if generator is None or not self.settings.mirror_share:
             return torch.zeros_like(self.symmetric)
-        return self.symmetric & (
-            torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
-        )
+        drawn = torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
+        return self.symmetric & drawn.to(self._device)
 
     def _split_actors(self, samples: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
         """Actors to decode and learn from, and the others that are met.
@@ -167,6 +181,7 @@ class Objective:
         Drawn in proportion to the square root of their samples: by samples alone the near ones of a full view would
         always keep out the far ones.
         """
+        samples = samples.cpu()  # so is the generator
         met = torch.nonzero(samples)[:, 0] if samples.any() else torch.zeros(1, dtype=torch.long)
         chance = samples[met].double().sqrt().clamp(min=1)
         if generator is not None:
@@ -174,4 +189,14 @@ class Objective:
             chance = torch.rand(len(met), generator=generator, dtype=torch.float64).log() / chance
         order = met[torch.argsort(chance, descending=True, stable=True)]
         learned = self.settings.decoded_actors
+        order = order.to(self._device)
         return order[:learned].sort().values, order[learned:].sort().values
+
+    def _occupancy(self, number: int) -> OccupancyGrid:
+        """A log's occupancy where the model is; a GPU keeps those that it had last."""
+        if self._device.type == "cpu":
+            return self.data[number].occupancy
+        return self._occupancy_there(number)
+
+    def _send_occupancy(self, number: int) -> OccupancyGrid:
+        return on_device(self.data[number].occupancy, self._device)

@@ -19,18 +19,21 @@ from torch.nn.utils import get_total_norm
 from genassets.driving import CLASSES
 from genassets.errors import StageError
 from genassets.fields.row_blocks import Place, in_memory
+from genassets.fields.triplane import half_planes
 from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.objective import Objective, StepResult
 from genassets.reconstruction.pages import Pages, completed, move_into, outside_pages
+from genassets.reconstruction.processes import ALONE, Processes, on_device
 from genassets.reconstruction.remembered_planes import LIMIT, RememberedPlanes
 from genassets.reconstruction.settings import LearningRates, ReconstructionSettings
 from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
 from genassets.reconstruction.training_log import OPEN_LOGS
 from genassets.reconstruction.workers import Workers
 from genassets.rendering.evaluation import ActorFields
+from genassets.rendering.occupancy import coarse_distance
 
 CURVE_EVERY = 20
 
@@ -41,11 +44,16 @@ Draw = Callable[[TrainingLog, ReconstructionSettings, int, np.random.Generator],
 
 @dataclass(frozen=True)
 class _Share:
-    """One view's part of a step: its log, terms and fields, and the gradient of each parameter or None."""
+    """One view's part of a step: its log, its terms, and the gradient of each parameter or None.
+
+    planes: what was decoded of the actors learned, then of bystanders, in half precision. refreshed: an actor and its
+    coarse distance, or None.
+    """
 
     log: int
     result: StepResult
-    fields: ActorFields
+    planes: Tensor
+    refreshed: tuple[int, Tensor] | None
     gradients: Sequence[Tensor | None]
 
 
@@ -56,6 +64,10 @@ class Trainer:
     no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw:
     what a view of a step is made of. With `pages`, codes, backgrounds and coarse distances lie there with their
     optimisers' moments, and in memory only while they are used.
+
+    With `processes` the views of a step are shared out: process r of n renders views r, r + n, ... What a view adds
+    is the same whoever renders it, and every process adds up all of them in their order, so that n changes nothing. The
+    model is on the device of `processes`.
     """
 
     def __init__(
@@ -67,11 +79,12 @@ class Trainer:
         pull: LatentPull | None = None,
         draw: Draw = draw_batch,
         pages: Pages | None = None,
+        processes: Processes = ALONE,
     ):
         self.model, self.data, self.settings, self.seed, self.pull = model, data, settings, seed, pull
-        self._draw = draw
+        self._draw, self.processes = draw, processes
         self.step = 0
-        self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
+        self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long, device=processes.device)
         self.planes = RememberedPlanes()
         self.objective = Objective(model, data, settings, self.planes)
         rates = settings.rates
@@ -84,9 +97,11 @@ class Trainer:
         self._met: set[int] = set()
         if pages is not None:
             move_into(pages, model, self.dense, self.sparse)
-        self.adversary = Adversary(rates.discriminator, seed) if settings.weights.adversarial else None
+        self.adversary = None
+        if settings.weights.adversarial:
+            self.adversary = Adversary(rates.discriminator, seed, processes.device)
         self._parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self._workers = Workers(settings.views)
+        self._workers = Workers(len(processes.own(settings.views)))
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
         views = np.array([max(len(log.observations), 1) for log in data], dtype=np.float64)
         self.log_chance = views / views.sum()
@@ -98,7 +113,8 @@ class Trainer:
             StageError: a loss or a gradient is not finite; names term or parameters, step, log and actors.
                 The step has then changed nothing of `state`.
         """
-        shares = self._workers.map(self._share, range(self.settings.views))
+        own = self._workers.map(self._share, self.processes.own(self.settings.views))
+        shares = self.processes.in_order(own)
         for parameter, parts in zip(
             self._parameters, zip(*(share.gradients for share in shares), strict=True), strict=True
         ):
@@ -133,17 +149,28 @@ class Trainer:
         rng = np.random.default_rng([self.seed, self.step, view])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         log = int(rng.choice(len(self.data), p=self.log_chance))
-        batch = self._draw(self.data[log], self.settings, self.model.stride, rng)
+        batch = on_device(
+            self._draw(self.data[log], self.settings, self.model.stride, rng), self.processes.device
+        )
         started = self.step >= self.settings.adversarial_start * self.settings.steps
         adversary = self.adversary if started else None
-        result, fields = self.objective.losses(log, batch, generator, adversary)
+        with self.processes.precision():
+            result, fields = self.objective.losses(log, batch, generator, adversary)
         weights = self.settings.weights.model_dump()
         for term, value in result.losses.items():
             if not torch.isfinite(value):
                 raise self._stopped(f"the loss term {term!r} is {value.item()}", [log], result)
         total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
         gradients = torch.autograd.grad(total / self.settings.views, self._parameters, allow_unused=True)
-        return _Share(log, result, fields, gradients)
+        planes = half_planes(fields.planes)
+        return _Share(log, result.detached(), planes, self._refreshed(view, result, fields), gradients)
+
+    def _refreshed(self, view: int, result: StepResult, fields: ActorFields) -> tuple[int, Tensor] | None:
+        """Of the first view, every few steps, the actor whose coarse distance is the stalest, and a new one."""
+        if view or self.step % self.settings.rendering.coarse_refresh:
+            return None
+        stalest = int(result.actors[self.refreshed[result.actors].argmin()])
+        return stalest, coarse_distance(fields, stalest, self.model.settings.coarse_resolution)
 
     def _pull(self, actors: Tensor) -> Tensor:
         """Add the prior's pull to the gradient of these actors' mean codes; returns the prior's gradients."""
@@ -167,17 +194,14 @@ class Trainer:
         )
 
     def _remember(self, shares: Sequence[_Share]) -> None:
-        """Keep what a step decoded: planes for when its actors are bystanders; of the first view one actor's
-        coarse distance.
-        """
-        passed = [(s.result.bystanders, s.fields.planes[len(s.result.actors) :]) for s in shares]
-        learned = [(s.result.actors, s.fields.planes[: len(s.result.actors)]) for s in shares]
+        """Keep what a step decoded: planes for when its actors are bystanders, and one actor's coarse distance."""
+        passed = [(s.result.bystanders, s.planes[len(s.result.actors) :]) for s in shares]
+        learned = [(s.result.actors, s.planes[: len(s.result.actors)]) for s in shares]
         for actors, planes in (*passed, *learned):  # what was learned is newer than what others looked past
             self.planes.keep(actors, planes)
-        if self.step % self.settings.rendering.coarse_refresh == 0:
-            actors = shares[0].result.actors
-            stalest = int(actors[self.refreshed[actors].argmin()])
-            self.model.refresh_coarse_distance(stalest, shares[0].fields)
+        if (first := shares[0].refreshed) is not None:
+            stalest, distance = first
+            self.model.coarse_distance[stalest] = distance
             self.refreshed[stalest] = self.step + 1
 
     def _set_rates(self) -> None:
@@ -207,7 +231,7 @@ class Trainer:
             RuntimeError, ValueError, KeyError: it is the state of another model.
         """
         self.step = int(state["step"])
-        self.refreshed = state["refreshed"]
+        self.refreshed = state["refreshed"].to(self.processes.device)
         self.planes.restore(state["planes"])
         expected = outside_pages(self.model.state_dict(), self.pages).keys()
         if expected != state["model"].keys():
@@ -294,12 +318,18 @@ def train(
     curve: Curve,
     pull: LatentPull | None = None,
     pages: Pages | None = None,
+    processes: Processes = ALONE,
 ) -> None:
-    """Train the model in place, from the checkpoint in work_dir where there is one."""
-    trainer = Trainer(model, data, settings, seed, pull, pages=pages)
+    """Train the model in place, from the checkpoint in work_dir where there is one.
+
+    Of several processes the first alone writes checkpoints, and says what comes of steps.
+    """
+    trainer = Trainer(model, data, settings, seed, pull, pages=pages, processes=processes)
     restore_checkpoint(trainer, work_dir)
     while trainer.step < settings.steps:
         result = trainer.advance()
+        if processes.rank:
+            continue
         step = trainer.step
         if step % CURVE_EVERY == 0 or step == settings.steps:
             for term, value in result.losses.items():
