@@ -14,7 +14,7 @@ from genassets.geometry.transforms import yaw_pose
 from genassets.reconstruction.adversary import Adversary, PatchDiscriminator
 from genassets.reconstruction.losses import discriminator_loss, generator_loss
 from genassets.reconstruction.settings import LossWeights, ReconstructionSettings
-from genassets.reconstruction.training import Trainer
+from genassets.reconstruction.training import Trainer, build_model
 from genassets.reconstruction.training_data import draw_batch
 from genassets.rendering.rays import cast_rays, mirrored
 from genassets.stages.reconstruct import ReconstructConfig, needed_files
@@ -172,3 +172,30 @@ def test_the_perceptual_loss_asks_for_its_file() -> None:
     assert not needed_files(ReconstructConfig())
     wanted = ReconstructConfig(weights=LossWeights(perceptual=0.1))
     assert needed_files(wanted) == {"lpips-vgg16": "reconstruct.weights.perceptual=0"}
+
+
+def test_in_mixed_precision_terms_and_gradients_are_those_of_single_precision_roughly(
+    prepared: Prepared,
+) -> None:
+    """On the CPU, which has the same kinds of numbers as a GPU: what networks give is taken up again in float32."""
+    settings = changed(FULL, model=FULL.model.model_copy(update={"shadow_hidden": 8}))
+    names = [log.scene.log_name for log in prepared.data]
+    trainer = Trainer(build_model(prepared.assets, names, settings, 0), prepared.data, settings, 0)
+    adversary, parameters = trainer.adversary, [*trainer.model.parameters()]
+
+    def judged() -> tuple[dict[str, torch.Tensor], list[torch.Tensor | None]]:
+        batch = draw_batch(prepared.data[0], settings, STRIDE, np.random.default_rng(2))
+        generator = torch.Generator().manual_seed(3)
+        losses = trainer.objective.losses(0, batch, generator, adversary)[0].losses
+        total = torch.stack([*losses.values()]).sum()
+        return losses, [*torch.autograd.grad(total, parameters, allow_unused=True)]
+
+    exact, gradients = judged()
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed, shorter = judged()
+    assert mixed.keys() == exact.keys() >= {"adversarial", "perceptual", "surface", "lidar"}
+    for term, value in mixed.items():
+        assert value.dtype == torch.float32 or term in ("adversarial", "perceptual"), term
+        assert value.item() == pytest.approx(exact[term].item(), rel=0.1, abs=0.02), term
+    assert [one is None for one in shorter] == [one is None for one in gradients]
+    assert all(one is None or one.to_dense().isfinite().all() for one in shorter)

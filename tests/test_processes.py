@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +53,9 @@ TOGETHER = changed(
 )
 
 
+Outcome = tuple[dict[tuple[str, int], float], dict[str, int], dict[str, torch.Tensor]]
+
+
 @dataclass(frozen=True)
 class Thing:
     name: str
@@ -75,7 +79,7 @@ def job_of(log: Log, directory: Path, processes: int, settings: ReconstructionSe
     )
 
 
-def outcome(job: Job) -> tuple[dict[tuple[str, int], float], dict[str, int], dict[str, torch.Tensor]]:
+def outcome(job: Job) -> Outcome:
     """Curves, counts and the library's numbers after running a job."""
     curves: dict[tuple[str, int], float] = {}
 
@@ -143,29 +147,34 @@ def test_more_processes_than_views_are_refused() -> None:
         ReconstructConfig(processes=3)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """Alone and together, so that sums are in the same order and numbers the same to the last bit."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="module")
-def alone(
-    log: Log, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[dict[tuple[str, int], float], dict[str, int], dict[str, torch.Tensor]]:
+def alone(log: Log, tmp_path_factory: pytest.TempPathFactory, one_thread: None) -> Outcome:
     return outcome(job_of(log, tmp_path_factory.mktemp("alone"), 1))
 
 
 @pytest.mark.slow
-def test_two_processes_give_the_numbers_of_one(log: Log, tmp_path: Path, alone: tuple) -> None:
-    """Every loss of every curve point and every number of the library; within rounding, if at all."""
+def test_two_processes_give_the_numbers_of_one(log: Log, tmp_path: Path, alone: Outcome) -> None:
+    """Every loss of every curve point and every number of the library, to the last bit."""
     job = job_of(log, tmp_path, 2)
     curves, counts, library = outcome(job)
     assert counts == alone[1]
-    assert curves.keys() == alone[0].keys() and ("loss/adversarial", 60) in curves
-    for point, value in curves.items():
-        assert value == pytest.approx(alone[0][point], rel=1e-5), point
+    assert curves == alone[0] and ("loss/adversarial", 60) in curves
     assert library.keys() == alone[2].keys()
-    for name, numbers in library.items():
-        torch.testing.assert_close(numbers, alone[2][name], rtol=1e-4, atol=1e-4)
+    assert [name for name, value in library.items() if not torch.equal(value, alone[2][name])] == []
 
 
 def run_and_wait_to_be_killed(root: Path, directory: Path) -> None:
     """Train in two processes; leaves a file once a checkpoint is there and training goes on."""
+    torch.set_num_threads(1)
     job = job_of(open_log(root), directory, 2)
 
     def curve(name: str, step: int, value: float) -> None:
@@ -178,7 +187,7 @@ def run_and_wait_to_be_killed(root: Path, directory: Path) -> None:
 
 @pytest.mark.slow
 def test_killed_in_the_middle_two_processes_go_on_to_the_same_numbers(
-    log: Log, tmp_path: Path, alone: tuple
+    log: Log, tmp_path: Path, alone: Outcome
 ) -> None:
     """SIGKILL of the process that started them: they have to end by themselves, and to leave a checkpoint whole."""
     first = multiprocessing.get_context("spawn").Process(
@@ -196,8 +205,8 @@ def test_killed_in_the_middle_two_processes_go_on_to_the_same_numbers(
     curves, counts, library = outcome(job)
     assert min(step for _, step in curves) >= 40  # from a checkpoint, not from the start
     assert counts == alone[1]
-    for name, value in library.items():
-        torch.testing.assert_close(value, alone[2][name], rtol=1e-4, atol=1e-4)
+    assert {point: value for point, value in alone[0].items() if point in curves} == curves
+    assert [name for name, value in library.items() if not torch.equal(value, alone[2][name])] == []
     left = [int(pid) for pid in (tmp_path / "pids").read_text().split()]
     assert len(left) == 3  # torchrun and two
     gone = psutil.wait_procs([psutil.Process(pid) for pid in left if psutil.pid_exists(pid)], timeout=30)[1]
