@@ -228,9 +228,13 @@ def test_an_error_of_a_process_is_the_error_of_all(log: Log, tmp_path: Path) -> 
 def test_a_process_that_is_killed_ends_the_others_with_an_error(log: Log, tmp_path: Path) -> None:
     job = job_of(log, tmp_path, 2)
 
+    killed: list[int] = []
+
     def kill_one(name: str, step: int, value: float) -> None:
-        workers = [p for p in psutil.Process().children(True) if "torch.distributed.run" not in p.cmdline()]
-        os.kill(max(p.pid for p in workers), signal.SIGKILL)
+        if not killed:
+            workers = psutil.Process().children(True)
+            killed.append(max(p.pid for p in workers if "torch.distributed.run" not in p.cmdline()))
+            os.kill(killed[0], signal.SIGKILL)
 
     with pytest.raises(StageError, match="ended with code 1 and said nothing") as caught:
         run_together(job, lambda *_: None, kill_one)
