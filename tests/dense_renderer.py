@@ -10,16 +10,16 @@ from torch import Tensor
 
 from genassets.fields.background import contract
 from genassets.fields.shadow import FOOTPRINT_MARGIN
-from genassets.rendering.rays import BOX_PADDING, Rays
-from genassets.rendering.renderer import (
+from genassets.rendering.evaluation import (
     ACTOR_REFERENCE_STEP,
     BACKGROUND_REFERENCE_STEP,
     BACKGROUND_START,
-    SHADOW_REACH,
     ActorFields,
     BackgroundFields,
-    RenderSettings,
 )
+from genassets.rendering.rays import BOX_PADDING, Rays
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.shading import SHADOW_REACH
 
 
 def bilinear(plane: Tensor, u: float, v: float) -> Tensor:

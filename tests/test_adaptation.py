@@ -38,7 +38,7 @@ def psnr(model: AssetModel, data: TrainingLog) -> float:
     trainer = Trainer(model, [data], SETTINGS, seed=0)
     batches = [draw_batch(data, SETTINGS, STRIDE, np.random.default_rng(number)) for number in range(8)]
     with torch.no_grad():
-        errors = [trainer.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches]
+        errors = [trainer.objective.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches]
     return -10 * math.log10(np.mean(errors))
 
 

@@ -13,10 +13,12 @@ from genassets.bench import learning, rendering, training
 from genassets.bench.dense_rendering import dense_features
 from genassets.bench.learning_cars import CarTask, draw_patches, make_cars, show
 from genassets.driving import Log
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.settings import ReconstructionSettings
-from genassets.reconstruction.training import Trainer, build_model, render_settings
+from genassets.reconstruction.training import Trainer, build_model
 from genassets.reconstruction.training_data import region_rays
-from genassets.rendering.renderer import cull, render_rays
+from genassets.rendering.culling import cull
+from genassets.rendering.renderer import render_rays
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +84,7 @@ def test_what_is_shown_is_what_is_trained(task: CarTask) -> None:
     trainer = Trainer(model, [task.data], settings, 0, draw=draw_patches)
     batch = draw_patches(task.data, settings, 1, np.random.default_rng(2))
     with torch.no_grad():
-        loss = trainer.losses(0, batch, None)[0].losses["rgb"].item()
+        loss = trainer.objective.losses(0, batch, None)[0].losses["rgb"].item()
     car = int(batch.rays.hits.actor[0])
     views = [v for v in task.data.views if v.actors.index[0] == car]
     truth = [i for v, i in zip(task.data.views, task.data.images, strict=True) if v.actors.index[0] == car]

@@ -14,7 +14,7 @@ from genassets.geometry.transforms import yaw_pose
 from genassets.reconstruction.adversary import Adversary, PatchDiscriminator
 from genassets.reconstruction.losses import discriminator_loss, generator_loss
 from genassets.reconstruction.settings import LossWeights, ReconstructionSettings
-from genassets.reconstruction.training import Trainer
+from genassets.reconstruction.training import Trainer, build_model
 from genassets.reconstruction.training_data import draw_batch
 from genassets.rendering.rays import cast_rays, mirrored
 from genassets.stages.reconstruct import ReconstructConfig, needed_files
@@ -52,10 +52,12 @@ def test_mirrored_rays_meet_the_mirrored_scene() -> None:
 def test_only_vehicles_are_mirrored_and_only_in_training(prepared: Prepared) -> None:
     trainer = prepared.trainer(changed(SETTINGS, mirror_share=1.0))
     vehicles = prepared.assets["actor_class"].isin(["Car", "Truck", "Bus"]).to_numpy()
-    assert trainer.symmetric.numpy()[vehicles].all()
-    assert not trainer.symmetric.numpy()[(prepared.assets["actor_class"] == "Pedestrian").to_numpy()].any()
-    assert torch.equal(trainer._mirrored_actors(torch.Generator()), trainer.symmetric)
-    assert not trainer._mirrored_actors(None).any()
+    assert trainer.objective.symmetric.numpy()[vehicles].all()
+    assert not trainer.objective.symmetric.numpy()[
+        (prepared.assets["actor_class"] == "Pedestrian").to_numpy()
+    ].any()
+    assert torch.equal(trainer.objective._mirrored_actors(torch.Generator()), trainer.objective.symmetric)
+    assert not trainer.objective._mirrored_actors(None).any()
 
 
 def test_hinge_losses_in_closed_form() -> None:
@@ -123,7 +125,7 @@ def test_training_with_the_full_objective_resumes_to_the_same_numbers(
 def compared(trainer: Trainer, settings: ReconstructionSettings) -> list[tuple[torch.Tensor, torch.Tensor]]:
     batch = draw_batch(trainer.data[0], settings, STRIDE, np.random.default_rng(2))
     with torch.no_grad():
-        return trainer.losses(0, batch, None)[0].compared
+        return trainer.objective.losses(0, batch, None)[0].compared
 
 
 def test_an_object_patch_is_the_actors_box_resized(prepared: Prepared) -> None:
@@ -148,7 +150,7 @@ def test_an_object_patch_is_the_actors_box_resized(prepared: Prepared) -> None:
 
 def test_without_their_weights_no_object_patch_is_rendered(prepared: Prepared) -> None:
     trainer = prepared.trainer()
-    assert trainer.perceptual is None
+    assert trainer.objective.perceptual is None
     assert trainer.adversary is None
     assert draw_batch(prepared.data[0], SETTINGS, STRIDE, np.random.default_rng(2)).object_patch is None
 
@@ -160,7 +162,7 @@ def test_carving_is_what_is_seen_before_the_returns(prepared: Prepared) -> None:
     def carving(shift: float) -> float:
         moved = dataclasses.replace(batch, lidar_distance=batch.lidar_distance + shift)
         with torch.no_grad():
-            return trainer.losses(0, moved, None)[0].losses["carving"].item()
+            return trainer.objective.losses(0, moved, None)[0].losses["carving"].item()
 
     assert carving(-1000.0) == 0
     assert 0 < carving(0.0) < carving(1000.0) <= 1
@@ -170,3 +172,30 @@ def test_the_perceptual_loss_asks_for_its_file() -> None:
     assert not needed_files(ReconstructConfig())
     wanted = ReconstructConfig(weights=LossWeights(perceptual=0.1))
     assert needed_files(wanted) == {"lpips-vgg16": "reconstruct.weights.perceptual=0"}
+
+
+def test_in_mixed_precision_terms_and_gradients_are_those_of_single_precision_roughly(
+    prepared: Prepared,
+) -> None:
+    """On the CPU, which has the same kinds of numbers as a GPU: what networks give is taken up again in float32."""
+    settings = changed(FULL, model=FULL.model.model_copy(update={"shadow_hidden": 8}))
+    names = [log.scene.log_name for log in prepared.data]
+    trainer = Trainer(build_model(prepared.assets, names, settings, 0), prepared.data, settings, 0)
+    adversary, parameters = trainer.adversary, [*trainer.model.parameters()]
+
+    def judged() -> tuple[dict[str, torch.Tensor], list[torch.Tensor | None]]:
+        batch = draw_batch(prepared.data[0], settings, STRIDE, np.random.default_rng(2))
+        generator = torch.Generator().manual_seed(3)
+        losses = trainer.objective.losses(0, batch, generator, adversary)[0].losses
+        total = torch.stack([*losses.values()]).sum()
+        return losses, [*torch.autograd.grad(total, parameters, allow_unused=True)]
+
+    exact, gradients = judged()
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed, shorter = judged()
+    assert mixed.keys() == exact.keys() >= {"adversarial", "perceptual", "surface", "lidar"}
+    for term, value in mixed.items():
+        assert value.dtype == torch.float32 or term in ("adversarial", "perceptual"), term
+        assert value.item() == pytest.approx(exact[term].item(), rel=0.1, abs=0.02), term
+    assert [one is None for one in shorter] == [one is None for one in gradients]
+    assert all(one is None or one.to_dense().isfinite().all() for one in shorter)

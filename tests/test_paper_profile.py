@@ -19,17 +19,15 @@ from genassets.fields.opacity import BETA_FLOOR
 from genassets.fields.shadow import ShadowHead
 from genassets.geometry.cameras import Intrinsics
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.scene import rendered_intrinsics
 from genassets.reconstruction.settings import ReconstructionSettings
-from genassets.reconstruction.training import build_model, parameter_groups, render_settings
+from genassets.reconstruction.training import build_model, parameter_groups
+from genassets.rendering.culling import cull
+from genassets.rendering.evaluation import ACTOR_REFERENCE_STEP, BACKGROUND_REFERENCE_STEP
 from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import BOX_PADDING, cast_rays
-from genassets.rendering.renderer import (
-    ACTOR_REFERENCE_STEP,
-    BACKGROUND_REFERENCE_STEP,
-    cull,
-    render_rays,
-)
+from genassets.rendering.renderer import render_rays
 from genassets.rendering.sampling import sample_actors, sample_sky, step_edges
 
 PROFILES = Path(__file__).parents[1] / "data_specs" / "profiles"

@@ -42,7 +42,9 @@ def rgb_error(trainer: Trainer) -> float:
         draw_batch(trainer.data[0], SETTINGS, STRIDE, np.random.default_rng(number)) for number in range(6)
     ]
     with torch.no_grad():
-        return float(np.mean([trainer.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches]))
+        return float(
+            np.mean([trainer.objective.losses(0, batch, None)[0].losses["rgb"].item() for batch in batches])
+        )
 
 
 @pytest.fixture(scope="module")

@@ -12,17 +12,12 @@ import torch
 from genassets.fields.feature_field import FeatureField
 from genassets.geometry.transforms import yaw_pose
 from genassets.rendering.compositing import accumulate, depth_order, render_weights
-from genassets.rendering.occupancy import background_occupancy, coarse_distance, prior_distance
+from genassets.rendering.culling import CoarseActors, cull
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
+from genassets.rendering.occupancy import background_occupancy, coarse_distance, prior_distances
 from genassets.rendering.rays import BOX_PADDING, Footprints, Hits, Rays, cast_rays, concatenate_rays
-from genassets.rendering.renderer import (
-    ActorFields,
-    BackgroundFields,
-    CoarseActors,
-    RenderSettings,
-    SampleCounts,
-    cull,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import SampleCounts, render_rays
 from genassets.rendering.rgb_network import RgbNetwork
 from genassets.rendering.sampling import sample_actors, sample_background, step_edges
 
@@ -285,7 +280,7 @@ def test_coarse_distance_of_an_untrained_actor_is_the_prior() -> None:
     fields = ActorFields(
         field, torch.tensor(20.0), torch.zeros(1, 3, 2, 4, 4), torch.zeros(1, dtype=torch.long), size
     )
-    assert torch.allclose(coarse_distance(fields, 0, 16), prior_distance(size, 16)[0], atol=1e-6)
+    assert torch.allclose(coarse_distance(fields, 0, 16), next(prior_distances(size, 16))[0], atol=1e-6)
 
 
 def test_paper_image_network_turns_480_x_270_into_1920_x_1080_by_four() -> None:

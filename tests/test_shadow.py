@@ -23,16 +23,12 @@ from genassets.reconstruction.scene_renderer import SceneRenderer
 from genassets.reconstruction.settings import ReconstructionSettings
 from genassets.reconstruction.training import Trainer, build_model, parameter_groups
 from genassets.reconstruction.training_data import prepare_training
+from genassets.rendering.culling import CoarseActors, cull
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
 from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import Rays, cast_rays, concatenate_rays, mirrored
-from genassets.rendering.renderer import (
-    ActorFields,
-    BackgroundFields,
-    CoarseActors,
-    RenderSettings,
-    cull,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import render_rays
 
 WITH_SHADOW = changed(TINY, model=TINY.model.model_copy(update={"shadow_hidden": 8}))
 

@@ -31,9 +31,9 @@ from genassets.evaluation.speed_error_plot import speed_error_plot
 from genassets.fields.triplane import resized_planes
 from genassets.pipeline.run_record import RunRecord, StepRecord
 from genassets.reconstruction.library import AssetLibrary, make_library
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.scene_renderer import SceneRenderer
-from genassets.reconstruction.training import render_settings
-from genassets.rendering.renderer import NEGLIGIBLE
+from genassets.rendering.render_settings import NEGLIGIBLE
 from genassets.rendering.sampling import OccupancyGrid
 
 POINTS = pd.DataFrame(

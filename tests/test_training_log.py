@@ -139,7 +139,8 @@ def test_training_in_pages_gives_the_numbers_of_training_in_memory(
 def test_what_is_released_comes_back_and_a_copy_is_restored(tmp_path: Path) -> None:
     pages = Pages(tmp_path / "pages.bin")
     start = torch.arange(3000, dtype=torch.float32).reshape(30, 100)
-    first, second = pages.place(start), pages.zeros(torch.zeros(5, dtype=torch.float16))
+    first = pages.place(start.shape, start.dtype, start.split(16))
+    second = pages.zeros([5], torch.float16)
     first[7] += 1
     second[2] = 3
     pages.release()
@@ -151,7 +152,7 @@ def test_what_is_released_comes_back_and_a_copy_is_restored(tmp_path: Path) -> N
     pages.restore(tmp_path / "copy.bin")
     assert torch.equal(first[7], start[7] + 1)
     assert second.tolist() == [0, 0, 3, 0, 0]
-    pages.zeros(torch.zeros(1))
+    pages.zeros([1], torch.float32)
     with pytest.raises(ValueError, match="expected"):
         pages.restore(tmp_path / "copy.bin")
 
@@ -161,7 +162,7 @@ def test_released_pages_take_no_memory(tmp_path: Path) -> None:
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     pages, size = Pages(tmp_path / "pages.bin"), 64 * 2**20
-    placed = pages.zeros(torch.empty(size // 4))
+    placed = pages.zeros([size // 4], torch.float32)
     before = resident()
     placed += 1
     assert resident() - before > 0.9 * size

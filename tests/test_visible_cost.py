@@ -13,6 +13,7 @@ from tiny_reconstruction import SETTINGS, Prepared
 
 from genassets.bench.visible_cost import make_case
 from genassets.driving import Log
+from genassets.fields.triplane import half_planes
 from genassets.reconstruction.library import make_library
 from genassets.reconstruction.remembered_planes import RememberedPlanes
 from genassets.reconstruction.scene import lidar_rays, scene_frame
@@ -107,8 +108,8 @@ def test_planes_are_remembered_up_to_a_limit_and_decoded_beyond(prepared: Prepar
     with torch.no_grad():
         decoded = model.decode(everyone, model.latents(everyone).code)
     torch.testing.assert_close(memory.of(model, everyone), decoded)
-    memory.keep(everyone, decoded + 1)
-    memory.keep(torch.tensor([1]), decoded[1:2] + 2)
+    memory.keep(everyone, half_planes(decoded + 1))
+    memory.keep(torch.tensor([1]), half_planes(decoded[1:2] + 2))
     assert list(memory.state()) == [2, 1]  # 0 is the longest unmet
     found = memory.of(model, everyone)
     torch.testing.assert_close(found[0], decoded[0])

@@ -29,6 +29,7 @@ def benchmarks() -> tuple[Benchmark, ...]:
         pipeline_overhead,
         rendering,
         training,
+        training_memory,
         visible_cost,
     )
 
@@ -40,4 +41,5 @@ def benchmarks() -> tuple[Benchmark, ...]:
         rendering.BENCHMARK,
         learning.BENCHMARK,
         training.BENCHMARK,
+        training_memory.BENCHMARK,
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 from genassets.fields.background import contract
 from genassets.fields.opacity import log_transmittance
 from genassets.fields.triplane import interpolate_triplanes
-from genassets.rendering.renderer import (
+from genassets.rendering.evaluation import (
     ACTOR_REFERENCE_STEP,
     BACKGROUND_REFERENCE_STEP,
     BACKGROUND_START,

@@ -177,9 +177,10 @@ def show(model: AssetModel, task: CarTask, settings: ReconstructionSettings) -> 
     """The unseen views as the model shows them, from mean codes: (n, size, size, 3) in [0, 1]."""
     import torch
 
-    from genassets.reconstruction.training import render_settings
+    from genassets.reconstruction.objective import render_settings
     from genassets.reconstruction.training_data import region_rays
-    from genassets.rendering.renderer import cull, render_rays
+    from genassets.rendering.culling import cull
+    from genassets.rendering.renderer import render_rays
 
     rendering = render_settings(settings.rendering)
     stride, context = model.stride, model.rgb.reach

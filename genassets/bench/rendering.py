@@ -94,8 +94,8 @@ def measure(
 
     from genassets.driving import open_log
     from genassets.evaluation.speed_error import DENSE, variants
+    from genassets.reconstruction.objective import render_settings
     from genassets.reconstruction.scene_renderer import SceneRenderer
-    from genassets.reconstruction.training import render_settings
 
     log = open_log(log_root)
     library = trained_library(log, settings, say)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import multiprocessing
-import resource
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -56,15 +55,20 @@ def run(say: Callable[[str], None]) -> Sequence[Row]:
     """Synthesize a log of 4 frames at 480 x 270 and measure with a laptop profile's model."""
     from genassets.city_spec import CitySpec
     from genassets.driving.synthetic.synthesize import synthesize_log
-    from genassets.reconstruction.settings import ModelSettings, ReconstructionSettings
 
-    settings = ReconstructionSettings(
-        image_scale=1.0, model=ModelSettings(decoder_groups=2, rgb_upsamplings=0, sharpness=30)
-    )
     with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:
         say("synthesizing the log")
         log_root = synthesize_log(CitySpec(frames=4, vehicles=20), SEED, "visible", Path(root))
-        return measure(log_root, ACTORS, settings, ROUNDS, say)
+        return measure(log_root, ACTORS, laptop_settings(), ROUNDS, say)
+
+
+def laptop_settings() -> ReconstructionSettings:
+    """Settings with the model of the laptop profile."""
+    from genassets.reconstruction.settings import ModelSettings, ReconstructionSettings
+
+    return ReconstructionSettings(
+        image_scale=1.0, model=ModelSettings(decoder_groups=2, rgb_upsamplings=0, sharpness=30)
+    )
 
 
 def measure(
@@ -93,8 +97,8 @@ def measure(
         say(f"memory of {count} actors")
         with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:
             library = Path(root)
-            training.append(_in_own_process(_training_peak_mib, log_root, count, settings, library))
-            rendering.append(_in_own_process(_rendering_peak_mib, log_root, count, library))
+            training.append(in_own_process(_training_peak_mib, log_root, count, settings, library))
+            rendering.append(in_own_process(_rendering_peak_mib, log_root, count, library))
     base = actors.index(MEMORY_BASE) if MEMORY_BASE in actors else 0
     rows: list[Row] = []
     for number, count in enumerate(actors):
@@ -128,7 +132,7 @@ def make_case(log_root: Path, actors: int, settings: ReconstructionSettings) -> 
             "observations": 1,
         }
     )
-    data = _training_log(log, settings)
+    data = training_log(log, settings)
     model = build_model(assets, [log.name], settings, SEED)
     library = make_library(assets, model, settings, [data.scene], [data.occupancy])
     return Case(log, library, Trainer(model, [data], settings, SEED))
@@ -164,7 +168,7 @@ def log_of(log: Log, actors: int) -> Log:
     return replace(log, tracks=tuple(tracks))
 
 
-def _training_log(log: Log, settings: ReconstructionSettings) -> TrainingLog:
+def training_log(log: Log, settings: ReconstructionSettings) -> TrainingLog:
     """The log's training data, with every actor in the library: those out of view were seen on another day."""
     import torch
 
@@ -273,7 +277,7 @@ def _training_peak_mib(log_root: Path, actors: int, settings: ReconstructionSett
     for _ in range(STEPS):
         case.trainer.advance()
     save_library(case.library, out)
-    return _peak_mib()
+    return peak_mib()
 
 
 def _rendering_peak_mib(log_root: Path, actors: int, library: Path) -> float:
@@ -283,14 +287,19 @@ def _rendering_peak_mib(log_root: Path, actors: int, library: Path) -> float:
 
     renderer, log = SceneRenderer.load(library), log_of(open_log(log_root), actors)
     renderer.render_region(log, CAMERA, 0, _region(renderer.view(log, CAMERA, 0)))
-    return _peak_mib()
+    return peak_mib()
 
 
-def _peak_mib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # Linux counts KiB
+def peak_mib() -> float:
+    """Peak resident memory of this process in MiB, from Linux.
+
+    Not getrusage's: of a process that was started with vfork it is at least that of the one that started it.
+    """
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))) / 1024
 
 
-def _in_own_process(work: Callable[..., float], *arguments: object) -> float:
+def in_own_process(work: Callable[..., float], *arguments: object) -> float:
     """What `work` returns in a fresh process: the peak of one that has done more would hide its own."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
         return pool.submit(work, *arguments).result()

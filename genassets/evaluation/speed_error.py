@@ -24,13 +24,9 @@ from genassets.fields.triplane import half_planes, resized_planes
 from genassets.geometry.cameras import pixel_centres
 from genassets.perceptual.lpips import Lpips, masked_distances
 from genassets.reconstruction.scene_renderer import RegionView, SceneRenderer
+from genassets.rendering.evaluation import ACTOR_REFERENCE_STEP, BACKGROUND_REFERENCE_STEP
 from genassets.rendering.occupancy import coarse_distance
-from genassets.rendering.renderer import (
-    ACTOR_REFERENCE_STEP,
-    BACKGROUND_REFERENCE_STEP,
-    NEGLIGIBLE,
-    RenderSettings,
-)
+from genassets.rendering.render_settings import NEGLIGIBLE, RenderSettings
 
 if TYPE_CHECKING:
     from torch import Tensor

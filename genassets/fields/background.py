@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from genassets.fields.row_blocks import Place, in_memory
 
 
 def contract(points: Float[Tensor, "samples 3"]) -> Float[Tensor, "samples 3"]:
@@ -27,9 +27,9 @@ class BackgroundPlanes(nn.Module):
         resolution: int,
         channels: int,
         generator: torch.Generator,
-        place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+        place: Place = in_memory,
     ) -> None:
         """place: where the planes are kept, as in AssetModel."""
         super().__init__()
-        start = torch.randn(1, 3, channels, resolution, resolution, generator=generator)
-        self.planes = nn.Parameter(place(0.1 * start))
+        start = 0.1 * torch.randn(1, 3, channels, resolution, resolution, generator=generator)
+        self.planes = nn.Parameter(place(start.shape, start.dtype, [start]))

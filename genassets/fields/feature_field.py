@@ -44,7 +44,7 @@ class FeatureField(nn.Module):
         self, plane_features: Float[Tensor, "samples inputs"]
     ) -> tuple[Float[Tensor, " samples"], Float[Tensor, "samples intermediate"]]:
         """Signed distance in metres, relative to the caller's shape prior, and what the feature is made of."""
-        out = self.geometry(plane_features)
+        out = self.geometry(plane_features).to(plane_features.dtype)  # autocast may have made it shorter
         return out[:, 0], torch.cat((out[:, 1:], plane_features), dim=-1)
 
     def feature(
@@ -55,7 +55,8 @@ class FeatureField(nn.Module):
             [intermediate.shape[1] - self.direct.in_features], dim=1
         )
         encoded = encode_directions(directions, self.direction_frequencies)
-        return self.appearance(torch.cat((F.relu(hidden), encoded), dim=-1)) + self.direct(plane_features)
+        feature = self.appearance(torch.cat((F.relu(hidden), encoded), dim=-1)) + self.direct(plane_features)
+        return feature.to(plane_features.dtype)
 
 
 def encode_directions(

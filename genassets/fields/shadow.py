@@ -43,7 +43,7 @@ class ShadowHead(nn.Module):
         fade = 1 - (place.abs() - half).amax(dim=-1, keepdim=True).clamp(min=0) / FOOTPRINT_MARGIN
         relative = place / (half + FOOTPRINT_MARGIN)
         darkness = F.softplus(self.network(torch.cat((plane_features, relative, fade), dim=-1)))
-        return -fade.clamp(min=0) * darkness
+        return -fade.clamp(min=0) * darkness.to(fade.dtype)
 
 
 def darken(

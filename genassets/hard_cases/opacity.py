@@ -12,7 +12,7 @@ from genassets.hard_cases.case import EPS, HardCase, Measured, difference, relat
 from genassets.hard_cases.scene import CAR, cast, fields, render, upright
 from genassets.reconstruction.settings import RenderingSettings
 from genassets.rendering.compositing import accumulate, log_light, render_weights
-from genassets.rendering.renderer import ACTOR_REFERENCE_STEP
+from genassets.rendering.evaluation import ACTOR_REFERENCE_STEP
 
 DISTANCES = torch.cat((torch.linspace(-10, 10, 2001), torch.tensor([1e-30, -1e-30, 0.0])))
 SHARP = 1e4

@@ -12,17 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from genassets.fields.feature_field import FeatureField
 from genassets.geometry.transforms import yaw_pose
 from genassets.hard_cases.case import EPS, difference, relative_difference
+from genassets.rendering.culling import CoarseActors, cull
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
 from genassets.rendering.occupancy import background_occupancy
 from genassets.rendering.rays import Rays, cast_rays
-from genassets.rendering.renderer import (
-    ActorFields,
-    BackgroundFields,
-    CoarseActors,
-    Rendered,
-    RenderSettings,
-    cull,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import Rendered, render_rays
 
 CAR = np.array([4.0, 2.0, 1.5])
 SETTINGS = RenderSettings(0.1, 0.0, 0.5, 0.0, 1.0, 30.0, 4, 0.0, exact=True)

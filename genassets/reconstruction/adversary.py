@@ -44,10 +44,10 @@ class PatchDiscriminator(nn.Module):
 class Adversary:
     """The discriminator with its optimiser; its initial values come from the seed alone."""
 
-    def __init__(self, rate: float, seed: int) -> None:
+    def __init__(self, rate: float, seed: int, device: torch.device | str = "cpu") -> None:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = PatchDiscriminator()
+            self.network = PatchDiscriminator().to(device)
         self.optimiser = torch.optim.Adam(self.network.parameters(), rate, betas=(0.5, 0.99))
 
     def scores(self, images: Iterable[Tensor]) -> Float[Tensor, " patches"]:

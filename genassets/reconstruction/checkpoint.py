@@ -48,7 +48,7 @@ def restore_checkpoint(trainer: Trainer, directory: Path) -> None:
     if not path.exists():
         return
     try:
-        state: dict[str, Any] = torch.load(path, weights_only=True)
+        state: dict[str, Any] = torch.load(path, trainer.processes.device, weights_only=True)
         name = state.pop("pages")
         if (name is None) != (trainer.pages is None):
             raise ValueError("it was written with pages" if name else "it was written without pages")

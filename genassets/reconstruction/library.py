@@ -11,7 +11,7 @@ config.json          settings, logs with their scene frames, occupancy grids' pl
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ import pandas as pd
 import torch
 from pydantic import BaseModel, FiniteFloat, PositiveFloat
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from genassets.driving import CLASSES
@@ -29,12 +29,16 @@ from genassets.errors import StageError
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.scene import SceneFrame
 from genassets.reconstruction.settings import ReconstructionSettings
+from genassets.reconstruction.tensor_file import write_tensors
 from genassets.reconstruction.training import build_model
 from genassets.rendering.sampling import OccupancyGrid
 
 FORMAT_VERSION = 1
 LATENTS = {"mean": "latent_mean.weight", "log_variance": "latent_log_variance.weight"}
 """Names in latents.safetensors, and of the model's parameters."""
+
+OF_ACTORS_AND_LOGS = (*LATENTS.values(), "coarse_distance", "backgrounds.", "lidar_occupancy.")
+"""Beginnings of the names of what belongs to one actor or log: it is read from the files as it is used."""
 
 COLUMNS = ("log", "actor_id", "actor_class", "size_l", "size_w", "size_h", "observations")
 
@@ -88,10 +92,12 @@ class AssetLibrary:
         return dict(zip(map(str, actor_ids), rows.tolist(), strict=True))
 
 
-def save_library(library: AssetLibrary, directory: Path) -> None:
-    """Write a library into a directory."""
+def save_library(
+    library: AssetLibrary, directory: Path, after_each: Callable[[], None] = lambda: None
+) -> None:
+    """Write a library into a directory, some bytes at a time; `after_each` follows them."""
     directory.mkdir(parents=True, exist_ok=True)
-    weights = {name: value.detach().contiguous() for name, value in library.model.state_dict().items()}
+    weights = library.model.state_dict()
     shape = (-1, *library.model.latent_shape)
     latents = {
         name: weights.pop(parameter).reshape(shape)
@@ -100,8 +106,8 @@ def save_library(library: AssetLibrary, directory: Path) -> None:
     }
     for log, grid in library.occupancy.items():
         weights[f"lidar_occupancy.{log}"] = grid.cells
-    save_file(latents, directory / "latents.safetensors")
-    save_file(weights, directory / "weights.safetensors")
+    write_tensors(directory / "latents.safetensors", latents, after_each)
+    write_tensors(directory / "weights.safetensors", weights, after_each)
     library.assets.to_parquet(directory / "assets.parquet", index=False)
     logs = [
         {
@@ -119,7 +125,7 @@ def save_library(library: AssetLibrary, directory: Path) -> None:
 
 
 def load_library(directory: Path) -> AssetLibrary:
-    """Read a library.
+    """Read a library; what belongs to one actor or log stays in its file until it is used.
 
     Raises:
         StageError: the directory holds no library, one of another format version, or a damaged one; names
@@ -143,7 +149,7 @@ def load_library(directory: Path) -> AssetLibrary:
         config = _Config.model_validate(values)
     names = [log.name for log in config.logs]
     assets = _read_assets(directory / "assets.parquet", names)
-    model = build_model(assets, names, config.settings, seed=0)
+    model = build_model(assets, names, config.settings, seed=0, place=_unfilled)
     parts = ("mean", "log_variance") if config.settings.model.decoder else ("mean",)
     codes = _read_codes(directory / "latents.safetensors", parts, (len(assets), *model.latent_shape))
     path = directory / "weights.safetensors"
@@ -157,10 +163,16 @@ def load_library(directory: Path) -> AssetLibrary:
             )
             for log in config.logs
         }
-        model.load_state_dict(weights | codes)
+        own = {n: v if n.startswith(OF_ACTORS_AND_LOGS) else v.clone() for n, v in weights.items()}
+        model.load_state_dict(own | codes, assign=True)
     model.eval()
     scenes = {log.name: SceneFrame(log.name, np.array(log.origin)) for log in config.logs}
     return AssetLibrary(assets, model, config.settings, scenes, occupancy)
+
+
+def _unfilled(shape: Sequence[int], dtype: torch.dtype, blocks: Iterable[Tensor]) -> Tensor:
+    """Room that the tensors of a file take the place of."""
+    return torch.empty(*shape, dtype=dtype)
 
 
 def _read_assets(path: Path, logs: Sequence[str]) -> pd.DataFrame:

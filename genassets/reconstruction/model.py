@@ -15,10 +15,12 @@ from genassets.fields.asset_decoder import AssetDecoder
 from genassets.fields.background import BackgroundPlanes
 from genassets.fields.feature_field import FeatureField
 from genassets.fields.opacity import Sharpness
+from genassets.fields.row_blocks import ROWS_AT_ONCE, Place, in_memory
 from genassets.fields.shadow import ShadowHead
 from genassets.reconstruction.settings import ModelSettings
-from genassets.rendering.occupancy import coarse_distance, prior_distance
-from genassets.rendering.renderer import ActorFields, BackgroundFields, CoarseActors
+from genassets.rendering.culling import CoarseActors
+from genassets.rendering.evaluation import ActorFields, BackgroundFields
+from genassets.rendering.occupancy import coarse_distance, prior_distances
 from genassets.rendering.rgb_network import RgbNetwork
 from genassets.rendering.sampling import OccupancyGrid
 
@@ -43,8 +45,8 @@ class AssetModel(nn.Module):
 
     sizes (actors, 3) are l, w, h in metres; class_index (actors,) points into CLASSES. Initial values come
     from the seed alone. Without a decoder (settings.decoder) a code is an actor's three planes, and neither embeddings
-    nor variances are there: the paper's ablation. place: what keeps the planes of a log's background, as they are
-    made: in memory by default.
+    nor variances are there: the paper's ablation. place: what keeps what belongs to one actor or log, as it is made: in
+    memory by default.
     """
 
     sizes: Tensor
@@ -58,7 +60,7 @@ class AssetModel(nn.Module):
         class_index: Tensor,
         logs: Sequence[str],
         seed: int,
-        place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+        place: Place = in_memory,
     ) -> None:
         super().__init__()
         self.settings = settings
@@ -71,9 +73,6 @@ class AssetModel(nn.Module):
             shape = (3 * settings.plane_channels, side, side)
         width = math.prod(shape)
         self.latent_shape = shape
-        # Sparse gradients: Adam then moves, and keeps the state of, only the codes that a step has met.
-        self.latent_mean = nn.Embedding(actors, width, sparse=True)
-        self.latent_log_variance = nn.Embedding(actors, width, sparse=True) if settings.decoder else None
         self.class_embedding = (
             nn.Parameter(LATENT_SPREAD * torch.randn(len(CLASSES), *shape, generator=generator))
             if settings.decoder
@@ -116,15 +115,23 @@ class AssetModel(nn.Module):
             )
             for _ in logs
         )
-        with torch.no_grad():
-            self.latent_mean.weight.copy_(LATENT_SPREAD * torch.randn(actors, width, generator=generator))
-            if self.latent_log_variance is not None:
-                self.latent_log_variance.weight.fill_(LOG_VARIANCE_START)
+
+        def codes(make: Callable[[int], Tensor]) -> nn.Embedding:
+            parts = torch.arange(actors).split(ROWS_AT_ONCE)
+            kept = place((actors, width), torch.float32, (make(len(part)) for part in parts))
+            # Sparse gradients: Adam then moves, and keeps the state of, only the codes that a step has met.
+            return nn.Embedding.from_pretrained(kept, freeze=False, sparse=True)
+
+        self.latent_mean = codes(lambda rows: LATENT_SPREAD * torch.randn(rows, width, generator=generator))
+        self.latent_log_variance = (
+            codes(lambda rows: torch.full((rows, width), LOG_VARIANCE_START)) if settings.decoder else None
+        )
         self.register_buffer("sizes", sizes.float())
         self.register_buffer("class_index", class_index.long())
         # Half precision is off by 0.05 % at most, little beside the radius of a cell, and every actor has a grid.
-        coarse = prior_distance(sizes.float(), settings.coarse_resolution, torch.float16)
-        self.register_buffer("coarse_distance", coarse)
+        grid = (settings.coarse_resolution,) * 3
+        distances = prior_distances(sizes.float(), settings.coarse_resolution)
+        self.register_buffer("coarse_distance", place((actors, *grid), torch.float16, distances))
 
     @property
     def stride(self) -> int:
@@ -153,7 +160,7 @@ class AssetModel(nn.Module):
         """Triplanes of some actors from their codes and their classes' embeddings."""
         if self.decoder is None or self.class_embedding is None:
             return code.reshape(len(code), 3, self.settings.plane_channels, *code.shape[-2:])
-        return self.decoder(code, self.class_embedding[self.class_index[actors]])
+        return self.decoder(code, self.class_embedding[self.class_index[actors]]).to(code.dtype)
 
     def coarse_actors(self) -> CoarseActors:
         """What culls samples and actors before anything is decoded."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import shutil
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import torch
 from torch import Tensor
 
 from genassets.errors import StageError
+from genassets.fields.row_blocks import ROWS_AT_ONCE, fill
 from genassets.reconstruction.model import AssetModel
 
 
@@ -29,20 +32,17 @@ class Pages:
         self._maps: list[mmap.mmap] = []
         self._addresses: set[int] = set()
 
-    def place(self, tensor: Tensor) -> Tensor:
-        """A copy of a tensor of the host, in the file."""
-        placed = self.zeros(tensor)
-        placed.copy_(tensor)
-        self.release()
-        return placed
+    def place(self, shape: Sequence[int], dtype: torch.dtype, blocks: Iterable[Tensor]) -> Tensor:
+        """The tensor whose rows are those of the blocks, in the file; takes the memory of one block."""
+        return fill(self.zeros(shape, dtype), blocks, self.release)
 
-    def zeros(self, like: Tensor) -> Tensor:
-        """Zeros of the shape and kind of another tensor, in the file.
+    def zeros(self, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
+        """Zeros of a shape and kind, in the file.
 
         Raises:
             StageError: the disk has no room for them.
         """
-        size = max(like.numel() * like.element_size(), 1)
+        size = max(math.prod(shape) * dtype.itemsize, 1)
         start = self._file.seek(0, os.SEEK_END)
         start += -start % mmap.ALLOCATIONGRANULARITY
         try:
@@ -55,7 +55,7 @@ class Pages:
             ) from error
         mapped = mmap.mmap(self._file.fileno(), size, offset=start)
         self._maps.append(mapped)
-        placed = torch.frombuffer(mapped, dtype=like.dtype, count=like.numel()).reshape(like.shape)
+        placed = torch.frombuffer(mapped, dtype=dtype, count=math.prod(shape)).reshape(*shape)
         self._addresses.add(placed.data_ptr())
         return placed
 
@@ -98,12 +98,15 @@ def move_into(
     of_actors = model.codes()
     for parameter in of_logs + of_actors:
         if not pages.hold(parameter):
-            parameter.data = pages.place(parameter.data)
-    model.coarse_distance = pages.place(model.coarse_distance)
+            parameter.data = pages.place(parameter.shape, parameter.dtype, parameter.data.split(ROWS_AT_ONCE))
+    if not pages.hold(coarse := model.coarse_distance):
+        model.coarse_distance = pages.place(coarse.shape, coarse.dtype, coarse.split(ROWS_AT_ONCE))
     beginnings = ((dense, of_logs, lambda: torch.zeros(())), (sparse, of_actors, lambda: 0))
     for optimiser, parameters, nothing in beginnings:
         for parameter in parameters:
-            moments = {name: pages.zeros(parameter) for name in ("exp_avg", "exp_avg_sq")}
+            moments = {
+                name: pages.zeros(parameter.shape, parameter.dtype) for name in ("exp_avg", "exp_avg_sq")
+            }
             optimiser.state[parameter] = {"step": nothing(), **moments}
 
 

@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from genassets.fields.triplane import half_planes
 from genassets.reconstruction.model import AssetModel
 
 LIMIT = 128
@@ -26,7 +25,7 @@ class RememberedPlanes:
     def of(self, model: AssetModel, actors: Int[Tensor, " n"]) -> Float[Tensor, "n 3 channels height width"]:
         """Planes of one or more actors in single precision; what is not remembered is decoded from mean codes."""
         missing = [actor for actor in actors.tolist() if actor not in self._planes]
-        index = torch.tensor(missing, dtype=torch.long)
+        index = torch.tensor(missing, dtype=torch.long, device=actors.device)
         decoded: Sequence[Tensor] = []
         if missing:
             decoded = tuple(model.decode(index, model.latents(index).code))
@@ -34,10 +33,10 @@ class RememberedPlanes:
         return torch.stack([fresh[a] if a in fresh else self._planes[a].float() for a in actors.tolist()])
 
     def keep(self, actors: Int[Tensor, " n"], planes: Float[Tensor, "n 3 channels height width"]) -> None:
-        """Remember planes as the actors' newest; the longest unmet are forgotten beyond the limit."""
+        """Remember half-precision planes as the actors' newest; beyond the limit the longest unmet are forgotten."""
         for actor, one in zip(actors.tolist(), planes, strict=True):
             self._planes.pop(actor, None)
-            self._planes[actor] = half_planes(one)
+            self._planes[actor] = one.clone()
         for actor in list(self._planes)[: max(len(self._planes) - self._limit, 0)]:
             del self._planes[actor]
 

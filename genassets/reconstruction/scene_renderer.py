@@ -20,20 +20,15 @@ from genassets.driving import Log
 from genassets.geometry.cameras import Intrinsics, pixel_centres, pixel_directions
 from genassets.geometry.transforms import transform_directions
 from genassets.reconstruction.library import AssetLibrary, load_library
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.scene import View, make_view, rendered_intrinsics
-from genassets.reconstruction.training import render_settings
 from genassets.reconstruction.training_data import region_rays
+from genassets.rendering.culling import cull
+from genassets.rendering.evaluation import ActorFields, actor_distance, padded_half_size
 from genassets.rendering.occupancy import cell_centres
 from genassets.rendering.rays import cast_rays
-from genassets.rendering.renderer import (
-    ActorFields,
-    RenderSettings,
-    SampleCounts,
-    actor_distance,
-    cull,
-    padded_half_size,
-    render_rays,
-)
+from genassets.rendering.render_settings import RenderSettings
+from genassets.rendering.renderer import SampleCounts, render_rays
 
 RAYS_AT_ONCE = 8192
 SAMPLES_AT_ONCE = 2**20

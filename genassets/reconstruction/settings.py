@@ -175,6 +175,20 @@ class ReconstructionSettings(_Settings):
     weights: LossWeights = LossWeights()
 
 
+class ComputeSettings(_Settings):
+    """What a reconstruction is computed with."""
+
+    processes: PositiveInt = Field(
+        default=1, description="processes that share out the views of a step, each with the whole model"
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        default="auto", description="where networks are; auto: a GPU where torch finds one"
+    )
+    precision: Literal["32-true", "bf16-mixed"] = Field(
+        default="32-true", description="bf16-mixed: networks compute in bfloat16, on a GPU alone"
+    )
+
+
 class AdaptationSettings(_Settings):
     """Learning a log's codes and background for a library that is there already, and nothing else."""
 

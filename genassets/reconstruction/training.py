@@ -13,45 +13,28 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
 from genassets.driving import CLASSES
-from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.errors import StageError
-from genassets.perceptual.lpips import MINIMUM_SIDE, Lpips
+from genassets.fields.row_blocks import Place, in_memory
+from genassets.fields.triplane import half_planes
 from genassets.reconstruction.adversary import Adversary
 from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
-from genassets.reconstruction.lidar_surface import draw_surface_samples
-from genassets.reconstruction.losses import (
-    generator_loss,
-    kl_loss,
-    lidar_loss,
-    rgb_loss,
-    surface_loss,
-    total_variation,
-)
 from genassets.reconstruction.model import AssetModel
+from genassets.reconstruction.objective import Objective, StepResult
 from genassets.reconstruction.pages import Pages, completed, move_into, outside_pages
-from genassets.reconstruction.remembered_planes import RememberedPlanes
-from genassets.reconstruction.settings import LearningRates, ReconstructionSettings, RenderingSettings
-from genassets.reconstruction.training_data import FREE_BEFORE_RETURN, Batch, TrainingLog, draw_batch
+from genassets.reconstruction.processes import ALONE, Processes, on_device
+from genassets.reconstruction.remembered_planes import LIMIT, RememberedPlanes
+from genassets.reconstruction.settings import LearningRates, ReconstructionSettings
+from genassets.reconstruction.training_data import Batch, TrainingLog, draw_batch
 from genassets.reconstruction.training_log import OPEN_LOGS
 from genassets.reconstruction.workers import Workers
-from genassets.rendering.rays import mirror_where, mirrored
-from genassets.rendering.renderer import (
-    ActorFields,
-    RenderSettings,
-    SampleCounts,
-    actor_distance,
-    cull,
-    render_rays,
-)
-from genassets.weights import load_lpips_arrays
+from genassets.rendering.evaluation import ActorFields
+from genassets.rendering.occupancy import coarse_distance
 
-PERCEPTUAL_FILE = "lpips-vgg16"
 CURVE_EVERY = 20
 
 Progress = Callable[[float, float, str], None]
@@ -60,41 +43,18 @@ Draw = Callable[[TrainingLog, ReconstructionSettings, int, np.random.Generator],
 
 
 @dataclass(frozen=True)
-class StepResult:
-    """The terms of one step, unweighted, the actors that it learned, those that it only looked past, and pairs of
-    rendered and observed images (n, 3, h, w) that the discriminator compares.
-    """
-
-    losses: dict[str, Tensor]
-    actors: Tensor
-    bystanders: Tensor
-    counts: SampleCounts
-    compared: list[tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
 class _Share:
-    """One view's part of a step: its log, terms and fields, and the gradient of each parameter or None."""
+    """One view's part of a step: its log, its terms, and the gradient of each parameter or None.
+
+    planes: what was decoded of the actors learned, then of bystanders, in half precision. refreshed: an actor and its
+    coarse distance, or None.
+    """
 
     log: int
     result: StepResult
-    fields: ActorFields
+    planes: Tensor
+    refreshed: tuple[int, Tensor] | None
     gradients: Sequence[Tensor | None]
-
-
-def render_settings(settings: RenderingSettings) -> RenderSettings:
-    """The renderer's settings from those of the spec."""
-    return RenderSettings(
-        settings.actor_step,
-        settings.actor_growth,
-        settings.background_step,
-        settings.background_growth,
-        settings.background_near,
-        settings.background_far,
-        settings.sky_samples,
-        settings.weight_threshold,
-        least_light=settings.least_light,
-    )
 
 
 class Trainer:
@@ -104,6 +64,10 @@ class Trainer:
     no gradient stay as they are. With `pull` a prior pulls at the mean codes of the actors that a step learns. draw:
     what a view of a step is made of. With `pages`, codes, backgrounds and coarse distances lie there with their
     optimisers' moments, and in memory only while they are used.
+
+    With `processes` the views of a step are shared out: process r of n renders views r, r + n, ... What a view adds
+    is the same whoever renders it, and every process adds up all of them in their order, so that n changes nothing. The
+    model is on the device of `processes`.
     """
 
     def __init__(
@@ -115,28 +79,30 @@ class Trainer:
         pull: LatentPull | None = None,
         draw: Draw = draw_batch,
         pages: Pages | None = None,
+        processes: Processes = ALONE,
     ):
         self.model, self.data, self.settings, self.seed, self.pull = model, data, settings, seed, pull
-        self._draw = draw
+        self._draw, self.processes = draw, processes
         self.step = 0
-        self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long)
-        self.planes = RememberedPlanes()  # what a step that only looks past an actor uses
+        self.refreshed = torch.zeros(len(model.sizes), dtype=torch.long, device=processes.device)
+        self.planes = RememberedPlanes()
+        self.objective = Objective(model, data, settings, self.planes)
         rates = settings.rates
         groups = parameter_groups(model, rates)
         self.dense = torch.optim.Adam(groups, betas=(0.9, 0.99), fused=True)
         codes = {"params": model.codes(), "lr": rates.latent if model.decoder else rates.background}
         self.sparse = torch.optim.SparseAdam([codes], betas=(0.9, 0.99))
         self.pages = pages
-        self._drawn: set[int] = set()  # logs since pages were released last
+        self._drawn: set[int] = set()  # logs since pages were released last, and actors
+        self._met: set[int] = set()
         if pages is not None:
             move_into(pages, model, self.dense, self.sparse)
-        weights = settings.weights
-        self.perceptual = Lpips(load_lpips_arrays(PERCEPTUAL_FILE), "vgg16") if weights.perceptual else None
-        self.adversary = Adversary(rates.discriminator, seed) if weights.adversarial else None
+        self.adversary = None
+        if settings.weights.adversarial:
+            self.adversary = Adversary(rates.discriminator, seed, processes.device)
         self._parameters = [parameter for parameter in model.parameters() if parameter.requires_grad]
-        self._workers = Workers(settings.views)
+        self._workers = Workers(len(processes.own(settings.views)))
         self.base_rates = [[group["lr"] for group in o.param_groups] for o in (self.dense, self.sparse)]
-        self.symmetric = torch.tensor([CLASSES[k] in VEHICLE_CLASSES for k in model.class_index.tolist()])
         views = np.array([max(len(log.observations), 1) for log in data], dtype=np.float64)
         self.log_chance = views / views.sum()
 
@@ -147,7 +113,8 @@ class Trainer:
             StageError: a loss or a gradient is not finite; names term or parameters, step, log and actors.
                 The step has then changed nothing of `state`.
         """
-        shares = self._workers.map(self._share, range(self.settings.views))
+        own = self._workers.map(self._share, self.processes.own(self.settings.views))
+        shares = self.processes.in_order(own)
         for parameter, parts in zip(
             self._parameters, zip(*(share.gradients for share in shares), strict=True), strict=True
         ):
@@ -170,9 +137,11 @@ class Trainer:
             self.adversary.learn(result.compared)
         self.step += 1
         self._drawn.update(share.log for share in shares)
-        if self.pages is not None and len(self._drawn) > OPEN_LOGS:
+        self._met |= result.counts.actors_met
+        if self.pages is not None and (len(self._drawn) > OPEN_LOGS or len(self._met) > LIMIT):
             self.pages.release()
             self._drawn.clear()
+            self._met.clear()
         return result
 
     def _share(self, view: int) -> _Share:
@@ -180,15 +149,28 @@ class Trainer:
         rng = np.random.default_rng([self.seed, self.step, view])
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
         log = int(rng.choice(len(self.data), p=self.log_chance))
-        batch = self._draw(self.data[log], self.settings, self.model.stride, rng)
-        result, fields = self.losses(log, batch, generator)
+        batch = on_device(
+            self._draw(self.data[log], self.settings, self.model.stride, rng), self.processes.device
+        )
+        started = self.step >= self.settings.adversarial_start * self.settings.steps
+        adversary = self.adversary if started else None
+        with self.processes.precision():
+            result, fields = self.objective.losses(log, batch, generator, adversary)
         weights = self.settings.weights.model_dump()
         for term, value in result.losses.items():
             if not torch.isfinite(value):
                 raise self._stopped(f"the loss term {term!r} is {value.item()}", [log], result)
         total = torch.stack([weights[term] * value for term, value in result.losses.items()]).sum()
         gradients = torch.autograd.grad(total / self.settings.views, self._parameters, allow_unused=True)
-        return _Share(log, result, fields, gradients)
+        planes = half_planes(fields.planes)
+        return _Share(log, result.detached(), planes, self._refreshed(view, result, fields), gradients)
+
+    def _refreshed(self, view: int, result: StepResult, fields: ActorFields) -> tuple[int, Tensor] | None:
+        """Of the first view, every few steps, the actor whose coarse distance is the stalest, and a new one."""
+        if view or self.step % self.settings.rendering.coarse_refresh:
+            return None
+        stalest = int(result.actors[self.refreshed[result.actors].argmin()])
+        return stalest, coarse_distance(fields, stalest, self.model.settings.coarse_resolution)
 
     def _pull(self, actors: Tensor) -> Tensor:
         """Add the prior's pull to the gradient of these actors' mean codes; returns the prior's gradients."""
@@ -211,113 +193,16 @@ class Trainer:
             "The last checkpoint is kept: lower the learning rates and run again."
         )
 
-    def losses(
-        self, number: int, batch: Batch, generator: torch.Generator | None
-    ) -> tuple[StepResult, ActorFields]:
-        """Render a batch of log `number` and compare it with what was observed; changes nothing.
-
-        Also returns the fields that were rendered: those of the actors learned, then of bystanders.
-        """
-        model, settings = self.model, self.settings
-        rendering = render_settings(settings.rendering)
-        swapped = self._mirrored_actors(generator)
-        rays = mirrored(batch.rays, swapped)
-        culled = cull(rays, model.coarse_actors(), rendering, generator)
-        actors, bystanders = self._split_actors(culled.samples_of_actors(rays), generator)
-        latents = model.latents(actors, generator)
-        decoded = model.decode(actors, latents.code)
-        planes = torch.cat((decoded, self.planes.of(model, bystanders))) if len(bystanders) else decoded
-        fields = model.actor_fields(torch.cat((actors, bystanders)), planes)
-        background = model.background_fields(number, self.data[number].occupancy)
-        lidar = slice(batch.camera_rays, None)
-        free_until = torch.zeros(len(rays))
-        free_until[lidar] = batch.lidar_distance - FREE_BEFORE_RETURN
-        rendered = render_rays(rays, culled, fields, background, rendering, generator, free_until)
-        patch_rays = batch.patches * batch.side**2
-        image = self._image(rendered.feature[:patch_rays], batch.side, batch.side)
-        losses = {
-            "rgb": rgb_loss(image, batch.pixels),
-            "total_variation": total_variation(decoded),
-        }
-        if latents.log_variance is not None:
-            losses["kl"] = kl_loss(latents.mean, latents.log_variance)
-        if len(batch.lidar_distance):
-            losses["lidar"] = lidar_loss(rendered.distance[lidar], batch.lidar_distance, settings.lidar_trim)
-            losses["carving"] = rendered.in_free_space[lidar].mean()
-        count = settings.surface_samples if settings.weights.surface else 0
-        samples = draw_surface_samples(self.data[number].returns, actors, count, generator)
-        if len(samples.position):
-            position = mirror_where(samples.position, swapped[samples.actor])
-            sdf, _ = actor_distance(position, samples.actor, fields)
-            on_surface, free = sdf.tensor_split([samples.returns])
-            losses["surface"] = surface_loss(on_surface, free, samples.clearance, settings.lidar_trim)
-        compared = self._compared(rendered.feature[patch_rays : batch.camera_rays], image, batch)
-        if compared and self.perceptual is not None:
-            distances = torch.cat([self.perceptual(shown, observed) for shown, observed in compared])
-            losses["perceptual"] = distances.mean()
-        if (
-            compared
-            and self.adversary is not None
-            and self.step >= settings.adversarial_start * settings.steps
-        ):
-            losses["adversarial"] = generator_loss(self.adversary.scores(shown for shown, _ in compared))
-        return StepResult(losses, actors, bystanders, rendered.counts, compared), fields
-
-    def _image(self, feature: Tensor, rows: int, columns: int) -> Tensor:
-        """Images (n, 3, h, w) of feature maps rows x columns, their margin cut off."""
-        image = self.model.rgb(feature.reshape(-1, rows, columns, feature.shape[-1]).permute(0, 3, 1, 2))
-        margin = self.settings.patch_margin * self.model.stride
-        height, width = image.shape[-2:]
-        return image[..., margin : height - margin, margin : width - margin]
-
-    def _compared(self, object_feature: Tensor, image: Tensor, batch: Batch) -> list[tuple[Tensor, Tensor]]:
-        """What networks compare: patches that are large enough for them, and the resized object patch."""
-        pairs = [(image, batch.pixels)] if min(image.shape[-2:]) >= MINIMUM_SIDE else []
-        if (shown := batch.object_patch) is not None:
-            images = self._image(object_feature, shown.rows, shown.columns), shown.pixels
-            size = (self.settings.object_patch_size,) * 2
-            rendered, observed = (
-                F.interpolate(i, size, mode="bilinear", align_corners=False) for i in images
-            )
-            pairs.append((rendered, observed))
-        return pairs
-
-    def _mirrored_actors(self, generator: torch.Generator | None) -> Tensor:
-        """Which actors of the library this view learns left for right."""
-        if generator is None or not self.settings.mirror_share:
-            return torch.zeros_like(self.symmetric)
-        return self.symmetric & (
-            torch.rand(len(self.symmetric), generator=generator) < self.settings.mirror_share
-        )
-
     def _remember(self, shares: Sequence[_Share]) -> None:
-        """Keep what a step decoded: planes for when its actors are bystanders; of the first view one actor's
-        coarse distance.
-        """
-        passed = [(s.result.bystanders, s.fields.planes[len(s.result.actors) :]) for s in shares]
-        learned = [(s.result.actors, s.fields.planes[: len(s.result.actors)]) for s in shares]
+        """Keep what a step decoded: planes for when its actors are bystanders, and one actor's coarse distance."""
+        passed = [(s.result.bystanders, s.planes[len(s.result.actors) :]) for s in shares]
+        learned = [(s.result.actors, s.planes[: len(s.result.actors)]) for s in shares]
         for actors, planes in (*passed, *learned):  # what was learned is newer than what others looked past
             self.planes.keep(actors, planes)
-        if self.step % self.settings.rendering.coarse_refresh == 0:
-            actors = shares[0].result.actors
-            stalest = int(actors[self.refreshed[actors].argmin()])
-            self.model.refresh_coarse_distance(stalest, shares[0].fields)
+        if (first := shares[0].refreshed) is not None:
+            stalest, distance = first
+            self.model.coarse_distance[stalest] = distance
             self.refreshed[stalest] = self.step + 1
-
-    def _split_actors(self, samples: Tensor, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Actors to decode and learn from, and the others that are met.
-
-        Drawn in proportion to the square root of their samples: by samples alone the near ones of a full view would
-        always keep out the far ones.
-        """
-        met = torch.nonzero(samples)[:, 0] if samples.any() else torch.zeros(1, dtype=torch.long)
-        chance = samples[met].double().sqrt().clamp(min=1)
-        if generator is not None:
-            # The largest of these keys are a draw without replacement (Efraimidis and Spirakis 2006).
-            chance = torch.rand(len(met), generator=generator, dtype=torch.float64).log() / chance
-        order = met[torch.argsort(chance, descending=True, stable=True)]
-        learned = self.settings.decoded_actors
-        return order[:learned].sort().values, order[learned:].sort().values
 
     def _set_rates(self) -> None:
         final = self.settings.rates.final
@@ -346,7 +231,7 @@ class Trainer:
             RuntimeError, ValueError, KeyError: it is the state of another model.
         """
         self.step = int(state["step"])
-        self.refreshed = state["refreshed"]
+        self.refreshed = state["refreshed"].to(self.processes.device)
         self.planes.restore(state["planes"])
         expected = outside_pages(self.model.state_dict(), self.pages).keys()
         if expected != state["model"].keys():
@@ -415,7 +300,7 @@ def build_model(
     logs: Sequence[str],
     settings: ReconstructionSettings,
     seed: int,
-    place: Callable[[Tensor], Tensor] = torch.Tensor.detach,
+    place: Place = in_memory,
 ) -> AssetModel:
     """An untrained model for a table of assets; `place` as in AssetModel."""
     sizes = torch.tensor(assets[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64))
@@ -433,12 +318,18 @@ def train(
     curve: Curve,
     pull: LatentPull | None = None,
     pages: Pages | None = None,
+    processes: Processes = ALONE,
 ) -> None:
-    """Train the model in place, from the checkpoint in work_dir where there is one."""
-    trainer = Trainer(model, data, settings, seed, pull, pages=pages)
+    """Train the model in place, from the checkpoint in work_dir where there is one.
+
+    Of several processes the first alone writes checkpoints, and says what comes of steps.
+    """
+    trainer = Trainer(model, data, settings, seed, pull, pages=pages, processes=processes)
     restore_checkpoint(trainer, work_dir)
     while trainer.step < settings.steps:
         result = trainer.advance()
+        if processes.rank:
+            continue
         step = trainer.step
         if step % CURVE_EVERY == 0 or step == settings.steps:
             for term, value in result.losses.items():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -10,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from genassets.fields.shape_prior import bounded_distance
-from genassets.rendering.renderer import ActorFields, actor_distance, padded_half_size
+from genassets.rendering.evaluation import ActorFields, actor_distance, padded_half_size
 from genassets.rendering.sampling import OccupancyGrid
 
 
@@ -20,15 +22,12 @@ def cell_centres(resolution: int) -> Float[Tensor, "cells 3"]:
     return torch.cartesian_prod(axis, axis, axis)
 
 
-def prior_distance(
-    size: Float[Tensor, "actors 3"], resolution: int, dtype: torch.dtype = torch.float32
-) -> Float[Tensor, "actors x y z"]:
-    """Coarse distance in metres of untrained actors: the rounded box that they start at."""
+def prior_distances(size: Float[Tensor, "actors 3"], resolution: int) -> Iterator[Float[Tensor, "1 x y z"]]:
+    """Coarse distance in metres of untrained actors, one after another: the rounded box that they start at."""
     centres = cell_centres(resolution)
-    grids = torch.empty(len(size), *(resolution,) * 3, dtype=dtype)
-    for grid, half, one in zip(grids.flatten(1), padded_half_size(size), size, strict=True):
-        grid.copy_(bounded_distance(centres * half, one.expand(len(centres), 3), torch.zeros(len(centres))))
-    return grids
+    for half, one in zip(padded_half_size(size), size, strict=True):
+        distance = bounded_distance(centres * half, one.expand(len(centres), 3), torch.zeros(len(centres)))
+        yield distance.reshape(1, resolution, resolution, resolution)
 
 
 @torch.no_grad()

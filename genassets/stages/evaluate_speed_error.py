@@ -71,8 +71,8 @@ def sweep(inputs: Inputs, config: SpeedErrorConfig, say: Callable[[str], None]) 
     """
     from genassets.evaluation.speed_error import knee, measure, pareto_front, variants
     from genassets.perceptual.lpips import Lpips
+    from genassets.reconstruction.objective import render_settings
     from genassets.reconstruction.scene_renderer import SceneRenderer
-    from genassets.reconstruction.training import render_settings
     from genassets.stages.ingested import open_ingested
     from genassets.weights import load_lpips_arrays
 

@@ -7,54 +7,65 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from genassets.reconstruction.settings import AdaptationSettings, ReconstructionSettings
+from pydantic import model_validator
+
+from genassets.reconstruction.settings import AdaptationSettings, ComputeSettings, ReconstructionSettings
 from genassets.specs.split import Split
 from genassets.stages.stage import Borrowed, Inputs, Metric, Stage, StageContext
 
 
-class ReconstructConfig(ReconstructionSettings):
-    """Settings of the reconstruction, the library that it starts from, if any, and the frames that it may see."""
+class ReconstructConfig(ReconstructionSettings, ComputeSettings):
+    """Settings of the reconstruction, what it is computed with, the library that it starts from, if any, and the
+    frames that it may see.
+    """
 
     split: Split = Split()
     adapt: AdaptationSettings | None = None
 
+    @model_validator(mode="after")
+    def _views_for_all(self) -> ReconstructConfig:
+        if self.processes > self.views:
+            raise ValueError(
+                f"processes is {self.processes}, but a step has {self.views} views to share out; take more views a "
+                "step, or fewer processes"
+            )
+        return self
+
 
 def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageContext) -> list[Metric]:
     """Train on every log of the dataset together; writes the asset library into out."""
-    from genassets.reconstruction.actor_colour import with_colours
-    from genassets.reconstruction.adaptation import adapted_model, unknown_classes
-    from genassets.reconstruction.library import load_library, make_library, save_library
-    from genassets.reconstruction.pages import Pages
-    from genassets.reconstruction.training import build_model, train
+    from genassets.reconstruction.job import Job
+    from genassets.reconstruction.launch import run_together
+    from genassets.reconstruction.processes import chosen_device, connect
     from genassets.reconstruction.training_data import prepare_training
     from genassets.reconstruction.training_log import PreparedLogs
     from genassets.stages.ingested import open_ingested
 
+    compute = ComputeSettings.model_validate(config.model_dump(include=set(ComputeSettings.model_fields)))
+    chosen_device(compute)
     logs = [open_ingested(path) for path in inputs.shards("ingest").values()]
-    settings = ReconstructionSettings.model_validate(config.model_dump(exclude={"split", "adapt"}))
+    settings = ReconstructionSettings.model_validate(
+        config.model_dump(include=set(ReconstructionSettings.model_fields))
+    )
     split = config.split
     stride = 2**settings.model.rgb_upsamplings
     prepared = context.work_dir / "prepared"
     if not PreparedLogs.exist(prepared):  # a run that was killed may have left them
         prepare_training(logs, split.train_cameras, split.is_training, settings, stride, prepared)
-    data = PreparedLogs(prepared)
-    assets = with_colours(data.assets, data)
-    names, counts = [log.name for log in logs], {"actors": len(assets)}
-    pages = Pages(context.work_dir / "pages.bin")
-    if config.adapt is None:
-        model = build_model(assets, names, settings, context.seed, pages.place)
+    job = Job(
+        prepared=prepared,
+        work_dir=context.work_dir,
+        out=out,
+        settings=settings,
+        seed=context.seed,
+        library=inputs.borrowed["reconstruct"] if config.adapt else None,
+        start=config.adapt.start if config.adapt else "random",
+        compute=compute,
+    )
+    if compute.processes > 1:
+        counts = run_together(job, context.progress, context.curve)
     else:
-        library = load_library(inputs.borrowed["reconstruct"])
-        model = adapted_model(library, assets, names, settings, config.adapt.start, context.seed)
-        unknown = assets["actor_class"].isin(unknown_classes(library.assets, assets))
-        counts["actors_of_classes_that_the_library_lacks"] = int(unknown.sum())
-    progress, curve = context.progress, context.curve
-    train(model, data, settings, context.seed, context.work_dir, progress, curve, pages=pages)
-    scenes, occupancy = [d.scene for d in data], [d.occupancy for d in data]
-    save_library(make_library(assets, model, settings, scenes, occupancy), out)
-    counts["views"] = sum(len(d.views) for d in data)
-    counts["parameters"] = sum(p.numel() for p in model.parameters())
-    counts["learned_parameters"] = sum(p.numel() for p in model.parameters() if p.requires_grad)
+        counts = job.run(connect(compute), context.progress, context.curve)
     return [
         Metric("reconstruction", "train", "all", name, value, value, "count")
         for name, value in counts.items()
@@ -90,7 +101,7 @@ STAGE = Stage(
     run=run,
     sharded=False,
     summary="Learn latents, decoder, fields and backgrounds",
-    runtime_only=frozenset({"checkpoint_every"}),
+    runtime_only=frozenset({"checkpoint_every", "processes", "device"}),
     borrows=borrowed_library,
     pretrained=needed_files,
 )
