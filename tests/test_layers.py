@@ -22,6 +22,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("genassets.evaluation",),
     ("genassets.curation",),
     ("genassets.masks", "genassets.export"),
+    ("genassets.prior",),
     ("genassets.reconstruction",),
     ("genassets.rendering",),
     ("genassets.fields",),

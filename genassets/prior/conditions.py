@@ -46,9 +46,7 @@ class Conditions:
 
     def opened(self) -> Conditions:
         """Both left open."""
-        return Conditions(
-            torch.full_like(self.actor_class, ANY_CLASS), torch.full_like(self.time, ANY_TIME)
-        )
+        return Conditions(torch.full_like(self.actor_class, ANY_CLASS), torch.full_like(self.time, ANY_TIME))
 
     def dropped(self, classes: Bool[Tensor, " n"], times: Bool[Tensor, " n"]) -> Conditions:
         """Some classes and some times left open."""
@@ -62,4 +60,6 @@ class Conditions:
 def _indices(names: Sequence[str | None], known: Sequence[str]) -> Int[Tensor, " n"]:
     if unknown := sorted({name for name in names if name is not None} - set(known)):
         raise ValueError(f"no {', '.join(unknown)}; expected one of {', '.join(known)}")
-    return torch.tensor([len(known) if name is None else known.index(name) for name in names], dtype=torch.long)
+    return torch.tensor(
+        [len(known) if name is None else known.index(name) for name in names], dtype=torch.long
+    )

@@ -92,7 +92,9 @@ class AssetPrior(nn.Module):
         channels, height, width = self.latent_shape
         return channels + SIZES, height, width
 
-    def assets(self, codes: Float[Tensor, "n c h w"], sizes: Float[Tensor, "n 3"]) -> Float[Tensor, "n a h w"]:
+    def assets(
+        self, codes: Float[Tensor, "n c h w"], sizes: Float[Tensor, "n 3"]
+    ) -> Float[Tensor, "n a h w"]:
         """Standardised assets of latent codes and box sizes (metres)."""
         return torch.cat(((codes - self.code_mean) / self.code_deviation, self.size_channels(sizes)), dim=1)
 

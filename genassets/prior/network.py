@@ -29,7 +29,8 @@ class ConditionedBlock(nn.Module):
         self.norm2 = nn.GroupNorm(group_count(settings.groups, channels_out), channels_out)
         self.dropout = nn.Dropout(settings.dropout)
         self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1)
-        nn.init.zeros_(self.conv2.weight)  # a block begins as its skip connection
+        for silent in self.conv2.parameters():
+            nn.init.zeros_(silent)  # a block begins as its skip connection
         self.skip = nn.Identity() if channels_in == channels_out else nn.Conv2d(channels_in, channels_out, 1)
 
     def forward(self, x: Float[Tensor, "n cin h w"], embedding: Float[Tensor, "n e"]) -> Tensor:
@@ -53,17 +54,20 @@ class _Stage(nn.Module):
 
 
 class DenoisingNetwork(nn.Module):
-    """Velocity of noisy codes (n, channels, h, w), h and w multiples of 2^(resolutions - 1), given timestep and conditions.
+    """Velocity of noisy codes (n, channels, h, w) given timestep and conditions.
 
-    The paper: channels 128, 256, 512 on 8 x 8 codes, hence 8, 4 and 2 texels a side, two blocks each. Class and time
-    of day have an embedding each, added to that of the timestep, which goes into every block.
+    h and w are multiples of 2^(resolutions - 1). The paper: channels 128, 256, 512 on 8 x 8 codes, hence 8, 4 and 2
+    texels a side, two blocks each. Class and time of day have an embedding each, added to that of the timestep, which
+    goes into every block.
     """
 
     def __init__(self, code_channels: int, settings: NetworkSettings) -> None:
         super().__init__()
         widths = settings.channels
         embedded = 4 * widths[0]
-        self.timestep = nn.Sequential(nn.Linear(widths[0], embedded), nn.SiLU(), nn.Linear(embedded, embedded))
+        self.timestep = nn.Sequential(
+            nn.Linear(widths[0], embedded), nn.SiLU(), nn.Linear(embedded, embedded)
+        )
         self.actor_class = nn.Embedding(len(CLASSES) + 1, embedded)
         self.time = nn.Embedding(len(TIMES) + 1, embedded)
         self.head = nn.Conv2d(code_channels, widths[0], 3, padding=1)
@@ -94,14 +98,16 @@ class DenoisingNetwork(nn.Module):
                 self.grow.append(nn.Conv2d(width, width, 3, padding=1))
         self.norm = nn.GroupNorm(group_count(settings.groups, current), current)
         self.tail = nn.Conv2d(current, code_channels, 3, padding=1)
-        nn.init.zeros_(self.tail.weight)
+        for silent in self.tail.parameters():
+            nn.init.zeros_(silent)
+        self.waves = widths[0]
         self.blocks = settings.blocks
         self.levels = len(widths)
 
     def forward(
         self, x: Float[Tensor, "n c h w"], t: Int[Tensor, " n"], conditions: Conditions
     ) -> Float[Tensor, "n c h w"]:
-        embedding = self.timestep(_waves(t, self.timestep[0].in_features).to(x.dtype))
+        embedding = self.timestep(_waves(t, self.waves).to(x.dtype))
         embedding = F.silu(embedding + self.actor_class(conditions.actor_class) + self.time(conditions.time))
         x = self.head(x)
         kept = [x]

@@ -71,7 +71,9 @@ def load_prior(directory: Path) -> TrainedPrior:
     """
     path = directory / FILE
     if not path.exists():
-        raise StageError(f"{path}: no prior here; expected the output of the train_prior stage. Run it first.")
+        raise StageError(
+            f"{path}: no prior here; expected the output of the train_prior stage. Run it first."
+        )
     try:
         with safe_open(path, "pt") as file:
             values = json.loads((file.metadata() or {})["genassets"])

@@ -39,7 +39,9 @@ class Schedule:
             ValueError: more steps than timesteps.
         """
         if not 1 <= steps <= self.timesteps:
-            raise ValueError(f"sampling steps are {steps}; expected 1 to {self.timesteps}, the prior's timesteps")
+            raise ValueError(
+                f"sampling steps are {steps}; expected 1 to {self.timesteps}, the prior's timesteps"
+            )
         spaced = np.arange(steps, 0, -1) * (self.timesteps / steps)
         return [int(t) for t in np.round(spaced).astype(int) - 1]
 

@@ -32,7 +32,9 @@ class NetworkSettings(_Settings):
     @model_validator(mode="after")
     def _angles_need_pairs(self) -> NetworkSettings:
         if self.channels[0] % 2:
-            raise ValueError(f"channels begin with {self.channels[0]}: an even number is needed for sines and cosines")
+            raise ValueError(
+                f"channels begin with {self.channels[0]}: an even number is needed for sines and cosines"
+            )
         return self
 
 
@@ -79,5 +81,5 @@ class SamplingSettings(_Settings):
     )
     guidance: Annotated[float, Field(ge=0)] = Field(
         default=1.5,
-        description="classifier-free guidance: 0 leaves the condition out, 1 is the conditional model, more exaggerates",
+        description="classifier-free guidance: 0 leaves conditions out, 1 is the conditional model, more exaggerates",
     )

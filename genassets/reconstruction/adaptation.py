@@ -55,12 +55,7 @@ def adapted_model(
     model = build_model(assets, logs, settings, seed)
     for name in unknown_classes(library.assets, assets):
         logger.warning("the library has no %s: their class embedding is as untrained as it was made", name)
-    frozen = {
-        name: value
-        for name, value in library.model.state_dict().items()
-        if name.partition(".")[0] not in LEARNED + OF_ACTORS
-    }
-    model.load_state_dict(model.state_dict() | frozen)
+    take_over(model, library.model)
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.partition(".")[0] in LEARNED)
     if start != "random":
@@ -71,6 +66,16 @@ def adapted_model(
                 code.copy_(shares @ of_library)
     model.refresh_coarse_distances()
     return model
+
+
+def take_over(model: AssetModel, of_library: AssetModel) -> None:
+    """Give a model a library's decoder, class embeddings, fields, sharpnesses and image network."""
+    frozen = {
+        name: value
+        for name, value in of_library.state_dict().items()
+        if name.partition(".")[0] not in LEARNED + OF_ACTORS
+    }
+    model.load_state_dict(model.state_dict() | frozen)
 
 
 def unknown_classes(library: pd.DataFrame, assets: pd.DataFrame) -> list[str]:
