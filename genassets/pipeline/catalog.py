@@ -12,9 +12,11 @@ from genassets.stages import (
     evaluate_turns,
     export,
     filter_occlusion,
+    generate,
     ingest,
     prepare_masks,
     reconstruct,
+    train_prior,
     turntables,
 )
 from genassets.stages.stage import Stage
@@ -28,6 +30,8 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_turns.STAGE,
     turntables.STAGE,
     export.STAGE,
+    train_prior.STAGE,
+    generate.STAGE,
     evaluate_speed_error.STAGE,
 )
 

@@ -11,6 +11,18 @@ PositiveFloat = Annotated[float, Field(gt=0)]
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 Solver = Literal["ddpm", "ddim", "dpm"]
+ClassName = Literal[
+    "Car",
+    "Truck",
+    "Bus",
+    "Construction Vehicle",
+    "Emergency Vehicle",
+    "Bicycle",
+    "Motorcycle",
+    "Pedestrian",
+]
+TimeOfDay = Literal["day", "night"]
+"""driving.CLASSES and conditions.TIMES, stated here, so that reading a spec imports neither torch nor numpy."""
 
 
 class _Settings(BaseModel):
@@ -21,11 +33,11 @@ class NetworkSettings(_Settings):
     """Sizes of the U-Net (paper, "Denoising Network")."""
 
     channels: tuple[PositiveInt, ...] = Field(
-        default=(64, 96, 128),
+        default=(48, 64, 96),
         min_length=1,
         description="channels of each resolution; between two of them lies a 2x scaling",
     )
-    blocks: PositiveInt = Field(default=2, description="residual blocks at each resolution")
+    blocks: PositiveInt = Field(default=1, description="residual blocks at each resolution")
     groups: PositiveInt = Field(default=32, description="groups of group normalisation, at most")
     dropout: Share = Field(default=0.1, description="share of activations left out in training, as in DDPM")
 
