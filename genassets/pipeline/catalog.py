@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pydantic import BaseModel
 
 from genassets.stages import (
+    evaluate_generation,
     evaluate_reconstruction,
     evaluate_speed_error,
     evaluate_turns,
@@ -32,6 +33,7 @@ CATALOG: tuple[Stage, ...] = (
     export.STAGE,
     train_prior.STAGE,
     generate.STAGE,
+    evaluate_generation.STAGE,
     evaluate_speed_error.STAGE,
 )
 

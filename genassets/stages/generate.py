@@ -179,10 +179,11 @@ def _picture(
     assets = made.library.assets.to_dict("records")[: config.pictured]
     for number, (asset, beside) in enumerate(zip(assets, made.neighbours.to_dict("records"), strict=False)):
         say(2 * number)
+        named = f"{beside['nearest_class']} {beside['nearest_actor_id'][:8]} of log {beside['nearest_log']}"
         size = " x ".join(f"{asset[name]:.1f}" for name in ("size_l", "size_w", "size_h"))
         caption = (
-            f"{asset['actor_class']} {asset['time_of_day']}, sample {asset['sample']}, {size} m; nearest: "
-            f"{beside['nearest_class']} {beside['nearest_actor_id'][:8]} of log {beside['nearest_log']} at {beside['distance']:.2f}"
+            f"{asset['actor_class']} {asset['time_of_day']}, sample {asset['sample']}, {size} m; "
+            f"nearest: {named} at {beside['distance']:.2f}"
         )
         panels = turned(new, LOG, asset["actor_id"])
         panels += turned(known, beside["nearest_log"], beside["nearest_actor_id"])
