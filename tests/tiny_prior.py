@@ -55,13 +55,12 @@ def make_library(actors: Sequence[tuple[str, str, tuple[float, float, float]]] =
     with torch.no_grad():
         model.latent_mean.weight.copy_(0.4 * torch.randn(model.latent_mean.weight.shape, generator=generator))
     model.refresh_coarse_distances()
-    nowhere = OccupancyGrid(torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(3), 1.0)
     return AssetLibrary(
         assets,
         model.eval(),
         SETTINGS,
         {log: SceneFrame(log, np.zeros(3)) for log in logs},
-        dict.fromkeys(logs, nowhere),
+        {log: OccupancyGrid(torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(3), 1.0) for log in logs},
     )
 
 

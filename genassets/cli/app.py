@@ -19,6 +19,7 @@ from genassets.cli.bench import bench
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
 from genassets.cli.export import export
+from genassets.cli.generate import generate
 from genassets.cli.hard_cases import hard_cases
 from genassets.cli.inspect import inspect
 from genassets.cli.list import list_runs
@@ -81,6 +82,7 @@ app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
+app.command("generate")(generate)
 app.command("speed-error")(speed_error)
 app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")

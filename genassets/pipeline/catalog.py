@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from genassets.stages import (
     evaluate_generation,
     evaluate_reconstruction,
+    evaluate_sampling,
     evaluate_speed_error,
     evaluate_turns,
     export,
@@ -34,6 +35,7 @@ CATALOG: tuple[Stage, ...] = (
     train_prior.STAGE,
     generate.STAGE,
     evaluate_generation.STAGE,
+    evaluate_sampling.STAGE,
     evaluate_speed_error.STAGE,
 )
 

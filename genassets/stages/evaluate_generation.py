@@ -329,7 +329,7 @@ def _picture(
 
 def needed_files(config: EvaluateGenerationConfig) -> dict[str, str]:
     """The pinned files that the evaluation cannot do without."""
-    return {"inception": "stages without evaluate_generation"}
+    return {"inception": "stages=[generate]"}
 
 
 STAGE = Stage(
