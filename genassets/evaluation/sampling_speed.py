@@ -25,8 +25,9 @@ from genassets.prior.settings import SamplingSettings, Solver
 from genassets.reconstruction.model import AssetModel
 
 SOLVERS: Sequence[Solver] = ("dpm", "ddim", "ddpm")
-STEPS = (5, 8, 10, 15, 25, 50, 100)
 COLUMNS = ("lever", "value", "seconds", "psnr_to_exact", "distance", "distance_error")
+LEAST_DIFFERENCE = 1e-6
+"""Of standardised codes; smaller ones are rounding."""
 REDRAWS = 8
 """Draws of each actor's posterior in the set that samples are compared with."""
 
@@ -40,7 +41,7 @@ def measure(
     guidance: float,
     repeats: int,
     say: Callable[[str], None],
-    steps: Sequence[int] = STEPS,
+    steps: Sequence[int],
 ) -> pd.DataFrame:
     """A row a solver (lever) and number of steps (value), columns COLUMNS.
 
@@ -49,46 +50,40 @@ def measure(
     timesteps, from the same noise; NaN for ddpm. distance: kernel distance x 1000 of standardised codes to draws of the
     library's posteriors, with its standard error.
     """
-    exact = {
-        solver: _drawn(prior, conditions, seed, _settings(solver, prior.schedule.timesteps, guidance))[0]
+    exact: dict[Solver, Array] = {
+        solver: _drawn(
+            prior,
+            conditions,
+            seed,
+            SamplingSettings(solver=solver, steps=prior.schedule.timesteps, guidance=guidance),
+        )[0]
         for solver in SOLVERS
         if solver != "ddpm"
     }
     known = _library(prior, codes, seed)
+    sweep = [
+        SamplingSettings(solver=solver, steps=count, guidance=guidance)
+        for solver in SOLVERS
+        for count in steps
+        if count <= prior.schedule.timesteps
+    ]
     rows = []
-    for solver in SOLVERS:
-        for count in (n for n in steps if n <= prior.schedule.timesteps):
-            say(f"{solver}, {count} steps")
-            settings = _settings(solver, count, guidance)
-            made, _ = _drawn(prior, conditions, seed, settings)
-            apart = float(np.sqrt(((made - exact[solver]) ** 2).mean())) if solver in exact else np.nan
-            found = kernel_distance(known, made, seed)
-            rows.append(
-                [
-                    solver,
-                    str(count),
-                    np.nan,
-                    -20 * np.log10(max(apart, 1e-6)),
-                    1000 * found.value,
-                    1000 * found.standard_error if found.standard_error is not None else np.nan,
-                ]
-            )
+    for settings in sweep:
+        say(f"{settings.solver}, {settings.steps} steps")
+        made, _ = _drawn(prior, conditions, seed, settings)
+        reference = exact.get(settings.solver)
+        apart = np.nan if reference is None else float(np.sqrt(((made - reference) ** 2).mean()))
+        found = kernel_distance(known, made, seed)
+        error = np.nan if found.standard_error is None else 1000 * found.standard_error
+        quality = -20 * np.log10(max(apart, LEAST_DIFFERENCE))
+        rows.append((settings.solver, str(settings.steps), np.nan, quality, 1000 * found.value, error))
     points = pd.DataFrame(rows, columns=list(COLUMNS))
     rounds = []
     for number in range(repeats):
         say(f"round {number + 1} of {repeats}")
-        rounds.append(
-            [
-                _seconds(prior, model, conditions, seed, _settings(row.lever, int(row.value), guidance))
-                for row in points.itertuples(index=False)
-            ]
-        )
+        rounds.append([_seconds(prior, model, conditions, seed, settings) for settings in sweep])
     points["seconds"] = np.median(rounds, axis=0)
     return points
-
-
-def _settings(solver: Solver, steps: int, guidance: float) -> SamplingSettings:
-    return SamplingSettings(solver=solver, steps=steps, guidance=guidance)
 
 
 def _drawn(

@@ -39,22 +39,24 @@ class EvaluateGenerationConfig(SamplingSettings):
     """Settings of the evaluation of generated actors, and how they are sampled."""
 
     images: int = Field(
-        500, ge=2, description="Real crops, and renders of each set of actors, at most; drawn with the seed."
+        default=500,
+        ge=2,
+        description="Real crops, and renders of each set of actors, at most; drawn with the seed.",
     )
     least_images: int = Field(
-        16, ge=8, description="With fewer real crops nothing is compared, and a count says so."
+        default=16, ge=8, description="With fewer real crops nothing is compared, and a count says so."
     )
     least_mask_px: int = Field(
-        100, ge=1, description="Mask pixels, at the size that is rendered, of a real crop."
+        default=100, ge=1, description="Mask pixels, at the size that is rendered, of a real crop."
     )
     max_truncation: float = Field(
-        0.1,
+        default=0.1,
         ge=0,
         le=1,
         description="Part of a real actor's box, turned or not, that may lie outside the image.",
     )
-    crop_margin: float = Field(0.1, ge=0, description="Context around the box, of its longer side.")
-    pictured: int = Field(8, ge=0, description="Places in the picture sheet.")
+    crop_margin: float = Field(default=0.1, ge=0, description="Context around the box, of its longer side.")
+    pictured: int = Field(default=8, ge=0, description="Places in the picture sheet.")
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def run(inputs: Inputs, config: EvaluateGenerationConfig, out: Path, context: St
     total = len(real) + len(casts) * len(places)
     network = Inception(path("inception"))
     crops = _crops(network, real, logs, renderer, config, context, total)
-    shown = {}
+    shown: dict[str, Shown] = {}
     for name, cast in casts.items():
         done = len(real) + len(shown) * len(places)
 

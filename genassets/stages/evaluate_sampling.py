@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.prior.settings import PositiveInt
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 
 MEASURES = ("seconds", "psnr_to_exact", "distance", "distance_error")
@@ -19,10 +20,17 @@ class EvaluateSamplingConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    actors: int = Field(128, ge=4, description="Actors sampled with every solver and number of steps.")
-    rounds: int = Field(3, ge=1, description="Rounds; seconds are their median.")
+    actors: int = Field(
+        default=128, ge=4, description="Actors sampled with every solver and number of steps."
+    )
+    steps: tuple[PositiveInt, ...] = Field(
+        default=(5, 8, 10, 15, 25, 50, 100),
+        min_length=1,
+        description="Numbers of steps, each with every solver.",
+    )
+    rounds: int = Field(default=3, ge=1, description="Rounds; seconds are their median.")
     guidance: float = Field(
-        1.0, ge=0, description="Classifier-free guidance; 1 is what the library's codes fit."
+        default=1.0, ge=0, description="Classifier-free guidance; 1 is what the library's codes fit."
     )
 
 
@@ -52,6 +60,7 @@ def run(inputs: Inputs, config: EvaluateSamplingConfig, out: Path, context: Stag
         config.guidance,
         config.rounds,
         lambda message: context.progress(0, 1, message),
+        config.steps,
     )
     compared = points.dropna(subset=["psnr_to_exact"])
     front = compared.index[pareto_front(compared)]

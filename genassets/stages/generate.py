@@ -30,14 +30,14 @@ DISTANCE = "root mean square difference of standardised codes"
 class GenerateConfig(SamplingSettings):
     """What is generated."""
 
-    count: int = Field(16, ge=1, description="actors generated")
+    count: int = Field(default=16, ge=1, description="actors generated")
     actor_class: ClassName | None = Field(
-        None,
+        default=None,
         description="their class; by default drawn, with the time of day, as often as the library has them",
     )
-    time: TimeOfDay | None = Field(None, description="day or night; by default drawn")
-    pictured: int = Field(8, ge=0, description="actors in the picture sheet")
-    resolution: int = Field(96, ge=32, le=512, description="pixels a side of a picture in it")
+    time: TimeOfDay | None = Field(default=None, description="day or night; by default drawn")
+    pictured: int = Field(default=8, ge=0, description="actors in the picture sheet")
+    resolution: int = Field(default=96, ge=32, le=512, description="pixels a side of a picture in it")
 
 
 @dataclass(frozen=True)
