@@ -17,8 +17,9 @@ from genassets.prior.sampling import Samples
 
 Array = NDArray[np.float64]
 
-COPY = 1.5
-"""A sample within so many times the distance of a posterior's draw is that actor again."""
+COPY = 1.1
+"""A sample within so many times the distance of a posterior's draw is that actor again. Draws hardly differ in it, for
+it is a mean over thousands of entries."""
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,8 @@ def draw_conditions(
     chance = wanted * counts
     if not chance.any():  # both are known, but never together: what the two embeddings make of it
         chance = wanted
-    edges = np.cumsum(chance.ravel()) / chance.sum()
+    edges = np.cumsum(chance.ravel())
+    edges /= edges[-1]  # exactly 1 at the end, whatever the sum was rounded to
     draws = [np.random.default_rng([seed, number, 1]).random() for number in range(count)]
     cells = np.searchsorted(edges, draws, side="right")
     classes, times = np.divmod(cells, len(TIMES))

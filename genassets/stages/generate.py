@@ -153,7 +153,7 @@ def metrics(made: Generated, config: GenerateConfig) -> list[Metric]:
         for name, value in distances.items()
         if value is not None
     ]
-    copies = "count of samples as near to an actor as a draw of its own posterior, within half as much again"
+    copies = "count of samples as near to an actor as a draw of its own posterior, within a tenth"
     rows.append(Metric("diversity", "all", "all", "copies", found.copies, n, copies))
     return rows
 
