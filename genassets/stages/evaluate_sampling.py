@@ -101,8 +101,6 @@ STAGE = Stage(
     needs=("ingest", "reconstruct", "train_prior"),
     modules=(
         "genassets.evaluation",
-        "genassets.curation",
-        "genassets.masks",
         "genassets.export",
         "genassets.prior",
         "genassets.reconstruction",
