@@ -19,6 +19,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("genassets.pipeline",),
     ("genassets.stages",),
     ("genassets.specs",),
+    ("genassets.completion",),
     ("genassets.evaluation",),
     ("genassets.curation",),
     ("genassets.masks", "genassets.export"),

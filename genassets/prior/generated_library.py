@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from genassets.driving.classes import CLASSES
 from genassets.prior.conditions import TIMES
@@ -58,19 +60,34 @@ def generated_library(library: AssetLibrary, samples: Samples, seed: int) -> Gen
             "sample": np.arange(len(classes)),
         }
     )
-    model = build_model(assets, [LOG], library.settings, seed=0)
+    made = library_of_codes(library, assets, SceneFrame(LOG, np.zeros(3)), samples.codes)
+    return GeneratedLibrary(made, int((sizes != wanted).any(axis=1).sum()))
+
+
+def library_of_codes(
+    library: AssetLibrary, assets: pd.DataFrame, scene: SceneFrame, codes: Float[Tensor, "n c h w"]
+) -> AssetLibrary:
+    """The library of a table of assets of one log with these codes, and a library's decoder and networks.
+
+    The log's background, and where there is any, are taken over where the library has the log; else it is empty.
+    """
+    log = scene.log_name
+    model = build_model(assets, [log], library.settings, seed=0)
     take_over(model, library.model)
     mean, log_variance = model.codes()
     with torch.no_grad():
-        mean.copy_(samples.codes.flatten(1))
+        mean.copy_(codes.flatten(1))
         log_variance.fill_(NO_SPREAD)
         for planes in model.backgrounds.parameters():
             planes.zero_()
+    occupancy = OccupancyGrid(torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(3), 1.0)
+    if log in library.occupancy:
+        known = library.model.backgrounds[library.model.logs.index(log)]
+        model.backgrounds[0].load_state_dict(known.state_dict())
+        occupancy, scene = library.occupancy[log], library.scenes[log]
     model.refresh_coarse_distances()
     model.eval()
-    nowhere = OccupancyGrid(torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(3), 1.0)
-    made = AssetLibrary(assets, model, library.settings, {LOG: SceneFrame(LOG, np.zeros(3))}, {LOG: nowhere})
-    return GeneratedLibrary(made, int((sizes != wanted).any(axis=1).sum()))
+    return AssetLibrary(assets, model, library.settings, {log: scene}, {log: occupancy})
 
 
 def within_reach(

@@ -13,7 +13,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from genassets.errors import StageError
 from genassets.reconstruction.actor_colour import COLOUR_COLUMNS
@@ -59,13 +61,20 @@ def adapted_model(
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.partition(".")[0] in LEARNED)
     if start != "random":
-        codes = zip(model.codes(), library.model.codes(), strict=True)
-        shares = torch.from_numpy(_shares(library.assets, assets, start)).float()
         with torch.no_grad():
-            for code, of_library in codes:
-                code.copy_(shares @ of_library)
+            for code, begun in zip(model.codes(), start_codes(library, assets, start), strict=True):
+                code.copy_(begun)
     model.refresh_coarse_distances()
     return model
+
+
+@torch.no_grad()
+def start_codes(
+    library: AssetLibrary, assets: pd.DataFrame, start: Literal["class_mean", "nearest"]
+) -> list[Float[Tensor, "assets entries"]]:
+    """Means, and log variances where the library has them, that the codes of some assets begin with."""
+    shares = torch.from_numpy(_shares(library.assets, assets, start)).float()
+    return [shares @ of_library for of_library in library.model.codes()]
 
 
 def take_over(model: AssetModel, of_library: AssetModel) -> None:
