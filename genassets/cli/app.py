@@ -16,6 +16,7 @@ import typer
 from genassets import __version__
 from genassets.cli import weights
 from genassets.cli.bench import bench
+from genassets.cli.complete import complete
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
 from genassets.cli.export import export
@@ -84,6 +85,7 @@ app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
 app.command("generate")(generate)
 app.command("speed-error")(speed_error)
+app.command("complete")(complete)
 app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")
 

@@ -77,7 +77,7 @@ def task_of(subject: Subject, actor_id: str, source: Source, views: int) -> Task
     rows = actor_rows(subject.rows, [actor_id])
     shots = choose_shots(rows, views) if source != "lidar" else []
     frames = [shot.frame for shot in shots] or None
-    sweeps = choose_sweeps(rows, views, frames) if source != "image" else []
+    sweeps = choose_sweeps(rows, views, frames, source == "lidar") if source != "image" else []
     return completion_task(subject.library, subject.log, subject.rows, [actor_id], shots, sweeps, False)
 
 

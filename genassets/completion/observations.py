@@ -100,16 +100,18 @@ def choose_shots(
     return chosen
 
 
-def choose_sweeps(rows: pd.DataFrame, count: int, frames: Sequence[int] | None = None) -> list[int]:
-    """`count` frames whose sweeps have most returns on the actors.
+def choose_sweeps(
+    rows: pd.DataFrame, count: int, frames: Sequence[int] | None = None, needed: bool = True
+) -> list[int]:
+    """`count` frames whose sweeps have most returns on the actors; none where there is none and none is needed.
 
     Raises:
-        StageError: no sweep has a return on them.
+        StageError: sweeps are needed, and none has a return on them.
     """
     known = rows[rows["lidar_count"].fillna(0) > 0]
     if frames is not None:
         known = known[known["frame"].isin(frames)]
-    if known.empty:
+    if known.empty and needed:
         raise StageError(
             f"complete: no LiDAR return lies on actor {', '.join(sorted(set(rows['actor_id'])))} in frame "
             f"{', '.join(map(str, frames or ['any']))}; choose other frames, or use --image-only"

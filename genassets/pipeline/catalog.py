@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from pydantic import BaseModel
 
 from genassets.stages import (
+    evaluate_completion,
     evaluate_generation,
     evaluate_reconstruction,
     evaluate_sampling,
@@ -36,6 +37,7 @@ CATALOG: tuple[Stage, ...] = (
     generate.STAGE,
     evaluate_generation.STAGE,
     evaluate_sampling.STAGE,
+    evaluate_completion.STAGE,
     evaluate_speed_error.STAGE,
 )
 
