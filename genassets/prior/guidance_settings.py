@@ -50,7 +50,7 @@ class GuidanceSettings(_Settings):
     """The gradient steps that are taken while the prior is sampled."""
 
     variant: Variant = Field(
-        default="denoiser",
+        default="plain",
         description="where the gradient is taken. plain: at the noisy code as it is, and the next one is moved (the "
         "paper); denoiser: at the clean code that the prior expects, through the network; clean: at that code alone",
     )

@@ -88,10 +88,10 @@ class RenderingLoss:
     def __call__(
         self, codes: Float[Tensor, "n c h w"], generator: torch.Generator | None
     ) -> Float[Tensor, ""]:
-        """The weighted sum of `terms`."""
+        """The weighted sum of `terms`; 0 where nothing is known of what was drawn."""
         weights = self.settings.model_dump()
         terms = self.terms(codes, generator)
-        return torch.stack([weights[name] * value for name, value in terms.items()]).sum()
+        return sum((weights[name] * value for name, value in terms.items()), start=0 * codes.sum())
 
     def terms(
         self, codes: Float[Tensor, "n c h w"], generator: torch.Generator | None
