@@ -21,6 +21,8 @@ from genassets.completion.sheet import completion_sheet
 from genassets.curation.object_table import write_object_table
 from genassets.driving import Log
 from genassets.errors import SpecError, StageError
+from genassets.evaluation.observation_crop import ImageScale
+from genassets.masks.run_length import encode_mask
 from genassets.pipeline.run_record import RunRecord, StepRecord
 from genassets.prior.generated_library import library_of_codes
 from genassets.prior.guidance_settings import GuidanceSettings, RefinementSettings
@@ -103,17 +105,32 @@ def test_sweeps_with_most_returns_come_first(rows: pd.DataFrame) -> None:
         choose_sweeps(own, 1, [2])
 
 
-def test_pixels_that_a_nearer_actor_may_hide_are_unknown(log: Log, rows: pd.DataFrame) -> None:
-    """The walker's mask in the moving car's image, and not the other way round."""
-    there = rows[(rows["camera"] == SHOT.camera) & (rows["frame"] == SHOT.frame)]
-    depth = there.drop_duplicates("actor_id").set_index("actor_id")["depth"]
-    assert depth[WALKER] < depth[MOVING]
-    far = tiny_task(log, [MOVING]).observed.images[0]
-    near = tiny_task(log, [WALKER]).observed.images[0]
-    walker, car = near.mask, far.mask
-    assert far.unknown[walker & ~car].all() and not (far.unknown & car).any()
-    edge = torch.nn.functional.max_pool2d(walker[None, None].float(), 3, 1, 1)[0, 0] > 0
-    assert torch.equal(near.unknown, edge & ~walker)
+def test_pixels_that_a_nearer_actor_may_hide_are_unknown() -> None:
+    """Two nearer actors, one with a mask and one with an outline alone, and a farther one behind."""
+
+    def mask(x0: int, x1: int) -> np.ndarray:
+        shown = np.zeros((8, 20), dtype=bool)
+        shown[2:6, x0:x1] = True
+        return shown
+
+    outline = [15.0, 2.0, 17.0, 2.0, 17.0, 5.0, 15.0, 5.0]
+    there = pd.DataFrame(
+        [
+            ("own", 10.0, 8.0, encode_mask(mask(6, 11)), outline),
+            ("nearer", 5.0, 4.0, encode_mask(mask(2, 5)), outline),
+            ("outlined", 6.0, 5.0, None, outline),
+            ("farther", 30.0, 28.0, encode_mask(mask(12, 14)), outline),
+        ],
+        columns=["actor_id", "depth", "nearest_depth", "mask_rle", "hull"],
+    ).assign(mask_height=8, mask_width=20)
+    found, unknown = _masks(there, ["own"], ImageScale(20, 8, 20, 8))
+    assert np.array_equal(found, mask(6, 11))
+    edge = np.zeros((8, 20), dtype=bool)
+    edge[1:7, 5:12] = True
+    outlined = np.zeros((8, 20), dtype=bool)
+    outlined[2:6, 15:18] = True
+    assert np.array_equal(unknown, (edge & ~found) | mask(2, 5) | outlined)
+    assert not unknown[:, 12:14].any()  # the farther one shows that the actor is not there
 
 
 def test_an_actor_is_completed_into_a_library_of_its_own(log: Log, prior: AssetPrior, tmp_path: Path) -> None:
