@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -81,16 +82,16 @@ def choose_shots(
         seen = "; ".join(f"{camera}: {', '.join(map(str, found))}" for camera, found in there.items())
         raise StageError(
             f"complete: no mask of actor {', '.join(sorted(set(rows['actor_id'])))} in "
-            f"{', '.join(cameras or ['any camera'])}, frame {', '.join(map(str, frames or ['any']))}; it has masks in "
+            f"{', '.join(cameras or ['any camera'])}, frame {_list(frames)}; it has masks in "
             f"{seen or 'no image: ask prepare_masks for its cameras, or use --lidar-only'}"
         )
     pixels = masked.groupby(["camera", "frame"])["mask_px"].sum().astype(float)
     first = masked.sort_values("mask_px", ascending=False).drop_duplicates(["camera", "frame"])
     azimuth = {
         Shot(str(row.camera), int(row.frame)): viewpoint_of(box_from_camera_of(row)).azimuth
-        for row in first.itertuples(index=False)
+        for row in _tuples(first)
     }
-    size = {Shot(str(camera), int(frame)): value for (camera, frame), value in pixels.items()}
+    size = {Shot(str(row.camera), int(row.frame)): float(row.mask_px) for row in _tuples(pixels.reset_index())}
     chosen = [max(size, key=lambda shot: size[shot])]
     while len(chosen) < min(count, len(size)):
         left = [shot for shot in size if shot not in chosen]
@@ -98,6 +99,14 @@ def choose_shots(
         apart = {s: min(angle_between(azimuth[s], azimuth[c]) for c in chosen) for s in good}
         chosen.append(max(good, key=lambda shot: (round(apart[shot]), size[shot])))
     return chosen
+
+
+def _tuples(rows: pd.DataFrame) -> Iterable[Any]:
+    return rows.itertuples(index=False)
+
+
+def _list(frames: Sequence[int] | None) -> str:
+    return "any" if frames is None else ", ".join(map(str, frames))
 
 
 def choose_sweeps(
@@ -169,7 +178,7 @@ def _masks(
     hidden = np.zeros_like(mask)
     own = there[there["actor_id"].isin(guided)]
     farthest = float(own["depth"].max()) if len(own) else 0.0
-    for row in there.itertuples(index=False):
+    for row in _tuples(there):
         if row.actor_id in guided:
             mask |= scale.mask(mask_of(row)) if row.mask_rle is not None else False
         elif row.nearest_depth < farthest:
