@@ -54,7 +54,9 @@ def library_beside(settings: ReconstructionSettings = SETTINGS) -> AssetLibrary:
     with torch.no_grad():
         generator = torch.Generator().manual_seed(1)
         model.latent_mean.weight.copy_(0.4 * torch.randn(model.latent_mean.weight.shape, generator=generator))
-        distance = model.field.geometry[-1].weight[0]  # 0 at the start: no code would have a shape of its own
+        distance = model.field.get_parameter("geometry.4.weight")[
+            0
+        ]  # 0 at the start: no code would have a shape of its own
         distance.copy_(0.2 * torch.randn(distance.shape, generator=generator))
     model.refresh_coarse_distances()
     nowhere = OccupancyGrid(torch.zeros(1, 1, 1, dtype=torch.bool), torch.zeros(3), 1.0)

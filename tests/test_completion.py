@@ -15,7 +15,7 @@ from tiny_prior import TINY, learn
 
 from genassets.cli.complete import complete as complete_command
 from genassets.completion.complete import CompletionSettings, complete, completion_task
-from genassets.completion.observations import Shot, actor_rows, choose_shots, choose_sweeps
+from genassets.completion.observations import Shot, _masks, actor_rows, choose_shots, choose_sweeps
 from genassets.completion.plots import sweep_plot, view_curves
 from genassets.completion.sheet import completion_sheet
 from genassets.curation.object_table import write_object_table
@@ -159,8 +159,6 @@ def test_lidar_alone_completes_and_is_drawn(log: Log, prior: AssetPrior) -> None
 def test_bystanders_and_background_are_those_of_the_library(log: Log, rows: pd.DataFrame) -> None:
     """Of a library that has learned the log: others keep their codes and hide what they hid; they do not come out."""
     beside = library_beside()
-    with torch.no_grad():
-        beside.model.backgrounds[0].planes.normal_()
     assets = pd.DataFrame(
         {
             "log": log.name,
@@ -175,12 +173,11 @@ def test_bystanders_and_background_are_those_of_the_library(log: Log, rows: pd.D
     codes = torch.randn(2, *beside.model.latent_shape)
     known = library_of_codes(beside, assets, scene_frame(log), codes)
     with torch.no_grad():
-        known.model.backgrounds[0].planes.normal_()
+        _planes(known).normal_()
     task = completion_task(known, log, rows, [MOVING], [SHOT], [], surroundings=True)
     assert task.surroundings and list(task.library.assets["actor_id"]) == [MOVING, WALKER]
     assert torch.equal(task.library.model.latents(torch.tensor([1])).mean[0], codes[0])
-    planes = [library.model.backgrounds[0].planes for library in (task.library, known)]
-    assert torch.equal(*planes)
+    assert torch.equal(_planes(task.library), _planes(known))
     loss = task.loss(TINY_LOSS)
     code = task.mean_codes().requires_grad_()
     terms = loss.terms(code, torch.Generator().manual_seed(0))
@@ -189,6 +186,12 @@ def test_bystanders_and_background_are_those_of_the_library(log: Log, rows: pd.D
     assert list(task.completed(code.detach()).assets["actor_id"]) == [MOVING]
     alone = completion_task(known, log, rows, [MOVING], [SHOT], [], surroundings=False)
     assert not alone.surroundings and list(alone.library.assets["actor_id"]) == [MOVING]
+
+
+def _planes(library: AssetLibrary) -> torch.Tensor:
+    planes = library.model.backgrounds[0].planes
+    assert isinstance(planes, torch.Tensor)
+    return planes
 
 
 def _run(tmp_path: Path, log: Log, rows: pd.DataFrame, prior: AssetPrior) -> Path:
@@ -319,6 +322,7 @@ def test_contenders_are_measured_against_truth_at_equal_seconds(tmp_path: Path) 
     from genassets.completion.measure import (
         COLUMNS,
         Grid,
+        Source,
         Subject,
         choose_actors,
         contenders,
@@ -340,9 +344,10 @@ def test_contenders_are_measured_against_truth_at_equal_seconds(tmp_path: Path) 
     actors = choose_actors(subject, 2, 20)
     assert actors
     grid = Grid(32, 16)
+    asked: list[tuple[Source, int]] = [("image", 1), ("lidar", 2), ("both", 1)]
     rows = [
         row
-        for source, views in (("image", 1), ("lidar", 2), ("both", 1))
+        for source, views in asked
         for row in contenders(subject, actors[0], source, views, QUICK, 0, grid)
     ]
     rows_of_variants = sweep(subject, actors[:1], ["plain", "clean"], [2], QUICK, 0, grid, lambda text: None)

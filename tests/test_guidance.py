@@ -17,18 +17,23 @@ from genassets.driving import Log
 from genassets.errors import StageError
 from genassets.prior.conditions import Conditions
 from genassets.prior.guidance import CodeLoss, clipped, guided_sample
-from genassets.prior.guidance_settings import GuidanceSettings, RefinementSettings, RenderingLossSettings
+from genassets.prior.guidance_settings import (
+    GuidanceSettings,
+    RefinementSettings,
+    RenderingLossSettings,
+    Variant,
+)
 from genassets.prior.model import SIZES, AssetPrior
 from genassets.prior.observed import Observed, observed, within_box
 from genassets.prior.pull import DiffusionPull
 from genassets.prior.refinement import refined
 from genassets.prior.sampling import SampleNoise, denoiser, sample
-from genassets.prior.settings import SamplingSettings
+from genassets.prior.settings import SamplingSettings, Solver
 from genassets.prior.solvers import solve
 from genassets.reconstruction.lidar_surface import ActorReturns
 from genassets.reconstruction.settings import RenderingSettings
 
-VARIANTS = ("plain", "denoiser", "clean")
+VARIANTS: tuple[Variant, ...] = ("plain", "denoiser", "clean")
 ONE_STEP = SamplingSettings(steps=1, solver="ddim", guidance=1.0)
 UNCLIPPED = 1e9
 
@@ -67,7 +72,7 @@ def start(prior: AssetPrior) -> Tensor:
 @pytest.mark.parametrize("solver", ["ddpm", "ddim", "dpm"])
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_scale_0_is_sampling_without_guidance_bit_for_bit(
-    prior: AssetPrior, variant: str, solver: str
+    prior: AssetPrior, variant: Variant, solver: Solver
 ) -> None:
     sampling = SamplingSettings(steps=6, solver=solver, guidance=3.0)
     conditions, sizes = asked(prior)
@@ -135,7 +140,7 @@ def test_through_the_denoiser_goes_its_transposed_jacobian(prior: AssetPrior) ->
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_guidance_leads_to_what_is_asked_for_and_sizes_stay(prior: AssetPrior, variant: str) -> None:
+def test_guidance_leads_to_what_is_asked_for_and_sizes_stay(prior: AssetPrior, variant: Variant) -> None:
     target = prior.code_mean + 1.5 * prior.code_deviation * torch.ones(prior.latent_shape)
     sampling = SamplingSettings(steps=12, guidance=1.0)
 
@@ -151,7 +156,7 @@ def test_guidance_leads_to_what_is_asked_for_and_sizes_stay(prior: AssetPrior, v
 @pytest.mark.parametrize("variant", VARIANTS)
 @pytest.mark.parametrize("solver", ["ddpm", "ddim", "dpm"])
 def test_a_huge_loss_moves_codes_no_further_than_the_bound(
-    prior: AssetPrior, variant: str, solver: str
+    prior: AssetPrior, variant: Variant, solver: Solver
 ) -> None:
     loss = toward(torch.full(prior.latent_shape, 1e12))
     sampling = SamplingSettings(steps=5, solver=solver, guidance=20.0)
@@ -170,7 +175,7 @@ def test_gradients_are_clipped_code_by_code() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_the_seed_decides(prior: AssetPrior, variant: str) -> None:
+def test_the_seed_decides(prior: AssetPrior, variant: Variant) -> None:
     def loss(codes: Tensor, generator: torch.Generator | None) -> Tensor:
         return ((codes - torch.randn(prior.latent_shape, generator=generator)) ** 2).mean()
 
@@ -180,7 +185,7 @@ def test_the_seed_decides(prior: AssetPrior, variant: str) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_loss_that_is_not_finite_stops(prior: AssetPrior, variant: str) -> None:
+def test_a_loss_that_is_not_finite_stops(prior: AssetPrior, variant: Variant) -> None:
     def loss(codes: Tensor, generator: torch.Generator | None) -> Tensor:
         return codes.sum() * math.nan
 

@@ -91,7 +91,9 @@ def choose_shots(
         Shot(str(row.camera), int(row.frame)): viewpoint_of(box_from_camera_of(row)).azimuth
         for row in _tuples(first)
     }
-    size = {Shot(str(row.camera), int(row.frame)): float(row.mask_px) for row in _tuples(pixels.reset_index())}
+    size = {
+        Shot(str(row.camera), int(row.frame)): float(row.mask_px) for row in _tuples(pixels.reset_index())
+    }
     chosen = [max(size, key=lambda shot: size[shot])]
     while len(chosen) < min(count, len(size)):
         left = [shot for shot in size if shot not in chosen]
@@ -123,7 +125,7 @@ def choose_sweeps(
     if known.empty and needed:
         raise StageError(
             f"complete: no LiDAR return lies on actor {', '.join(sorted(set(rows['actor_id'])))} in frame "
-            f"{', '.join(map(str, frames or ['any']))}; choose other frames, or use --image-only"
+            f"{_list(frames)}; choose other frames, or use --image-only"
         )
     each = known.drop_duplicates(["actor_id", "frame"]).groupby("frame")["lidar_count"].sum().astype(int)
     return [int(frame) for frame in each.sort_values(ascending=False, kind="stable").index[:count]]

@@ -54,8 +54,12 @@ class EvaluateCompletionConfig(BaseModel):
     swept_variants: tuple[Variant, ...] = Field(
         default=("plain", "denoiser", "clean"), description="variants of guidance that are compared"
     )
-    resolution: int = Field(64, ge=32, le=256, description="Pixels a side at which turns meet the true ones.")
-    sdf_resolution: int = Field(48, ge=16, le=512, description="Grid points a side for the surface mesh.")
+    resolution: int = Field(
+        default=64, ge=32, le=256, description="Pixels a side at which turns meet the true ones."
+    )
+    sdf_resolution: int = Field(
+        default=48, ge=16, le=512, description="Grid points a side for the surface mesh."
+    )
     sampling: SamplingSettings = SamplingSettings()
     loss: RenderingLossSettings = RenderingLossSettings()
     guidance: GuidanceSettings = GuidanceSettings()
