@@ -18,17 +18,12 @@ from genassets.prior.observed import Observed, ObservedImage
 from genassets.reconstruction.library import AssetLibrary
 from genassets.reconstruction.lidar_surface import draw_surface_samples
 from genassets.reconstruction.losses import lidar_loss, surface_loss
-from genassets.reconstruction.training import render_settings
+from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.training_data import LIDAR_BEHIND, region_rays
+from genassets.rendering.culling import cull
+from genassets.rendering.evaluation import ActorFields, BackgroundFields, actor_distance
 from genassets.rendering.rays import Rays, cast_rays, concatenate_rays
-from genassets.rendering.renderer import (
-    ActorFields,
-    BackgroundFields,
-    Rendered,
-    actor_distance,
-    cull,
-    render_rays,
-)
+from genassets.rendering.renderer import Rendered, render_rays
 
 AROUND = 2
 """Feature pixels around an actor's box that a window may show."""
