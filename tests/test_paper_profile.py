@@ -1,4 +1,4 @@
-"""Profile `paper` against every number of the paper's supplement that reconstruction has a place for.
+"""Profile `paper` against every number of the paper's supplement that reconstruction and prior have a place for.
 
 Each number is written out here with the paragraph of the supplement, or the section of the main text, that it is from.
 """
@@ -18,6 +18,9 @@ from genassets.fields.asset_decoder import NonLocalBlock, ResidualBlock
 from genassets.fields.opacity import BETA_FLOOR
 from genassets.fields.shadow import ShadowHead
 from genassets.geometry.cameras import Intrinsics
+from genassets.prior.model import SIZES
+from genassets.prior.network import DenoisingNetwork
+from genassets.prior.settings import PriorSettings
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.objective import render_settings
 from genassets.reconstruction.scene import rendered_intrinsics
@@ -201,3 +204,16 @@ def test_a_ray_is_rendered_with_all_of_it(model: AssetModel, paper: Reconstructi
 
 def test_the_small_profiles_leave_the_shadow_out() -> None:
     assert [profile(name).model.shadow_hidden for name in ("laptop", "workstation")] == [0, 0]
+
+
+def test_denoising_network() -> None:
+    document = yaml.safe_load((PROFILES / "paper.yaml").read_text(encoding="utf-8"))
+    prior = PriorSettings.model_validate(document["train_prior"])
+    with torch.device("meta"):
+        network = DenoisingNetwork(32 + SIZES, prior.network)
+    assert len(network.shrink) == len(network.grow) == 2  # two 2x scaling modules
+    assert prior.network.blocks == 2  # residual blocks of each
+    assert (network.head.out_channels, network.norm.num_channels) == (128, 128)  # base channel
+    widths = [block.out_channels for block in network.shrink if isinstance(block, nn.Conv2d)]
+    assert [*widths, prior.network.channels[-1]] == [128, 256, 512]
+    assert (prior.steps, prior.rate, prior.final_rate) == (100_000, 1e-4, 1.0)  # Training Details

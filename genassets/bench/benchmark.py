@@ -24,6 +24,7 @@ def benchmarks() -> tuple[Benchmark, ...]:
     """Every benchmark, in the order of the table. Modules import heavy libraries inside ``run``."""
     from genassets.bench import (
         adaptation_start,
+        frechet,
         learning,
         masks,
         pipeline_overhead,
@@ -42,4 +43,5 @@ def benchmarks() -> tuple[Benchmark, ...]:
         learning.BENCHMARK,
         training.BENCHMARK,
         training_memory.BENCHMARK,
+        frechet.BENCHMARK,
     )

@@ -16,9 +16,11 @@ import typer
 from genassets import __version__
 from genassets.cli import weights
 from genassets.cli.bench import bench
+from genassets.cli.complete import complete
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
 from genassets.cli.export import export
+from genassets.cli.generate import generate
 from genassets.cli.hard_cases import hard_cases
 from genassets.cli.inspect import inspect
 from genassets.cli.list import list_runs
@@ -81,7 +83,9 @@ app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
+app.command("generate")(generate)
 app.command("speed-error")(speed_error)
+app.command("complete")(complete)
 app.command("inspect")(inspect)
 app.add_typer(weights.app, name="weights")
 

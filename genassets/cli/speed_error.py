@@ -11,11 +11,13 @@ import typer
 if TYPE_CHECKING:
     import pandas as pd
 
-    from genassets.pipeline.run_record import RunRecord
-
 FOLDER = "speed_error"
 STAGES = ("reconstruct", "ingest", "filter_occlusion", "evaluate_reconstruction")
 """Whose outputs are read."""
+ADVICE = (
+    "expected a run that went through evaluate_reconstruction. Finish it with `genassets resume`, or name "
+    "another one."
+)
 
 
 def speed_error(
@@ -41,6 +43,7 @@ def speed_error(
 
     from PIL import Image
 
+    from genassets.cli.run_outputs import outputs_of
     from genassets.evaluation.speed_error_plot import speed_error_plot
     from genassets.pipeline.home import Home
     from genassets.pipeline.run_record import RunRecord, find_run
@@ -49,7 +52,7 @@ def speed_error(
 
     directory = find_run(Home.from_environment().runs, run)
     record = RunRecord.load(directory)
-    outputs = Inputs({stage: _outputs(record, stage) for stage in STAGES})
+    outputs = Inputs({stage: outputs_of(record, stage, ADVICE) for stage in STAGES})
     config = SpeedErrorConfig(seconds=seconds, crops=crops, rounds=rounds, lpips=lpips)
     points, rendered = sweep(outputs, config, lambda message: typer.echo(f"  {message}", err=True))
     out = directory / FOLDER
@@ -61,20 +64,6 @@ def speed_error(
         typer.echo(json.dumps(document | {"points": points.to_dict("records")}, indent=1))
     else:
         _print(points, rendered, out)
-
-
-def _outputs(record: RunRecord, stage: str) -> dict[str, Path]:
-    """Where the run's record says that a stage's outputs lie, by shard; StageError where it made none."""
-    from genassets.errors import StageError
-
-    steps = [step for step in record.stages if step.name == stage]
-    found = {step.shard or "": Path(step.path) for step in steps if step.path and Path(step.path).is_dir()}
-    if not found or len(found) < len(steps):
-        raise StageError(
-            f"{record.directory}: the run has no output of {stage}; expected a run that went through "
-            "evaluate_reconstruction. Finish it with `genassets resume`, or name another one."
-        )
-    return found
 
 
 def _print(points: pd.DataFrame, observations: int, out: Path) -> None:

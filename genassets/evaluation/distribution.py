@@ -1,4 +1,4 @@
-"""How far two sets of images are apart, by their features: Fréchet and kernel distance (FID and KID).
+"""How far two sets of images are apart, by their features: Fréchet and kernel distance (FID and KID), and coverage.
 
 All in float64. No square root of a matrix is taken: of a product of covariances only the trace of its root is
 needed, and that is a sum of singular values, which are never negative and never complex.
@@ -11,12 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.distance import cdist
 
 Array = NDArray[np.float64]
 
 SUBSETS = 100
 LARGEST_SUBSET = 1000
 """Images of each set in a subset of the kernel distance, at most (Bińkowski et al. 2018)."""
+NEIGHBOURS = 3
+"""Of precision and recall."""
 ROUNDING = 1e-8
 """A covariance may be off symmetric, or have a negative eigenvalue, by this part of its largest one."""
 
@@ -25,7 +28,8 @@ def frechet_distance(mu1: ArrayLike, sigma1: ArrayLike, mu2: ArrayLike, sigma2: 
     """Squared Fréchet distance between two Gaussians with means (d,) and covariances (d, d).
 
     |mu1 - mu2|^2 + tr(sigma1) + tr(sigma2) - 2 tr((sigma1 sigma2)^(1/2)). With sigma = factor' factor the last trace
-    is the sum of the singular values of factor1 factor2'; factors come from symmetric eigenvalues.
+    is the sum of the singular values of factor1 factor2'. Factors are Cholesky's, or come from symmetric eigenvalues
+    where a sigma lacks rank.
 
     Raises:
         ValueError: shapes differ, a value is not finite, or a sigma is no covariance.
@@ -102,13 +106,38 @@ def kernel_distance(
     return KernelDistance(float(np.mean(values)), error, subsets, size)
 
 
+@dataclass(frozen=True)
+class Coverage:
+    """Precision: share of shown images that lie among the real ones. Recall: share of real ones among the shown."""
+
+    precision: float
+    recall: float
+
+
+def coverage(real: ArrayLike, shown: ArrayLike, neighbours: int = NEIGHBOURS) -> Coverage:
+    """Precision and recall of features (n, d) and (m, d) by nearest neighbours (Kynkäänniemi et al. 2019).
+
+    A set covers what lies within a ball around any of its images that reaches to the image's k-th nearest other one.
+
+    Raises:
+        ValueError: no more rows than neighbours, unequal widths, or a value that is not finite.
+    """
+    first, second = _features(real, shown, least=neighbours + 1)
+    across = cdist(first, second)
+    reach = [np.partition(cdist(f, f), neighbours, axis=1)[:, neighbours] for f in (first, second)]
+    return Coverage(
+        precision=float((across <= reach[0][:, None]).any(axis=0).mean()),
+        recall=float((across <= reach[1][None]).any(axis=1).mean()),
+    )
+
+
 def _features(x: ArrayLike, y: ArrayLike, least: int) -> tuple[Array, Array]:
     first, second = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     for features in (first, second):
         if features.ndim != 2 or features.shape[1] == 0 or features.shape[1] != first.shape[-1]:
             raise ValueError(f"features {first.shape} and {second.shape} must be (n, d) and (m, d)")
         if len(features) < least:
-            raise ValueError(f"{len(features)} images have no covariance; expected at least {least}")
+            raise ValueError(f"{len(features)} images are too few; expected at least {least}")
         if not np.isfinite(features).all():
             raise ValueError("a feature is not finite: look for the image that it comes from")
     return first, second
@@ -130,7 +159,11 @@ def _factor_of(sigma: Array) -> Array:
     largest = float(np.abs(sigma).max())
     if not np.allclose(sigma, sigma.T, rtol=0.0, atol=ROUNDING * largest):
         raise ValueError("a covariance is symmetric; this matrix is not")
-    values, vectors = np.linalg.eigh((sigma + sigma.T) / 2)
+    sigma = (sigma + sigma.T) / 2
+    try:
+        return np.asarray(np.linalg.cholesky(sigma).T)  # a fraction of the time of eigenvalues
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(sigma)
     if values[0] < -ROUNDING * len(sigma) * largest:
         raise ValueError(f"a covariance has no negative eigenvalue; this matrix has {values[0]:.3g}")
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)

@@ -9,12 +9,21 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from genassets.evaluation.speed_error import EXACT
 
-def speed_error_plot(points: pd.DataFrame) -> NDArray[np.uint8]:
+
+def speed_error_plot(
+    points: pd.DataFrame,
+    seconds: str = "seconds for all crops",
+    quality: str = "PSNR to the exact mode, dB",
+) -> NDArray[np.uint8]:
     """Every point of `evaluation.speed_error.measure`, with its columns pareto and knee, as an image (h, w, 3).
 
     Seconds run to the right, dB to the exact mode upwards: good is up and to the left. The exact mode itself has
     no error and is left out.
+
+    Args:
+        seconds, quality: what is written along the axes.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -22,7 +31,7 @@ def speed_error_plot(points: pd.DataFrame) -> NDArray[np.uint8]:
     figure = Figure(figsize=(9, 5.5), dpi=110, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
-    shown = points[points["psnr_to_exact"] < points["psnr_to_exact"].max()]
+    shown = points[points["lever"] != EXACT].dropna(subset=["psnr_to_exact"])
     for lever, part in shown.groupby("lever", sort=False):
         axes.plot(part["seconds"], part["psnr_to_exact"], "o", markersize=5, label=lever)
     rows: Iterable[Any] = shown.itertuples()
@@ -48,8 +57,8 @@ def speed_error_plot(points: pd.DataFrame) -> NDArray[np.uint8]:
         label="knee",
     )
     axes.set_xscale("log")
-    axes.set_xlabel("seconds for all crops")
-    axes.set_ylabel("PSNR to the exact mode, dB")
+    axes.set_xlabel(seconds)
+    axes.set_ylabel(quality)
     axes.grid(True, which="both", linewidth=0.3)
     axes.legend(fontsize=7, ncols=2)
     canvas.draw()

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from genassets.curation.object_crops import cut_region, square_region
@@ -50,6 +51,19 @@ def source_of(row: Any) -> Source:
     """The source of a row of the object table that is kept."""
     size = (float(row.size_l), float(row.size_w), float(row.size_h))
     return Source(observation_of(row), size, box_from_camera_of(row))
+
+
+def library_sources(
+    rows: pd.DataFrame, log: Log, renderer: ImageRenderer, least_mask_px: int, max_truncation: float
+) -> list[Source]:
+    """The sources among a log's rows of the object table: kept, with so many mask pixels at the size that is rendered,
+    and no larger part of the box outside the image.
+    """
+    scales = {camera: image_scale(log, camera, renderer) for camera in rows["camera"].unique()}
+    shrink = rows["camera"].map(lambda camera: scales[camera].area_ratio).astype(float)
+    whole = rows["truncation"] <= max_truncation
+    masked = (rows["mask_px"].astype(float) * shrink >= least_mask_px).fillna(False)
+    return [source_of(row) for row in rows[rows["kept"] & whole & masked].itertuples(index=False)]
 
 
 def drawn(count: int, most: int, generator: np.random.Generator) -> list[int]:

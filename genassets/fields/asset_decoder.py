@@ -15,9 +15,9 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels_in: int, channels_out: int, groups: int = 32) -> None:
         super().__init__()
-        self.norm1 = nn.GroupNorm(_groups(groups, channels_in), channels_in)
+        self.norm1 = nn.GroupNorm(group_count(groups, channels_in), channels_in)
         self.conv1 = nn.Conv2d(channels_in, channels_out, 3, padding=1)
-        self.norm2 = nn.GroupNorm(_groups(groups, channels_out), channels_out)
+        self.norm2 = nn.GroupNorm(group_count(groups, channels_out), channels_out)
         self.conv2 = nn.Conv2d(channels_out, channels_out, 3, padding=1)
         self.skip = (
             nn.Identity()
@@ -36,7 +36,7 @@ class NonLocalBlock(nn.Module):
 
     def __init__(self, channels: int, groups: int = 32) -> None:
         super().__init__()
-        self.norm = nn.GroupNorm(_groups(groups, channels), channels)
+        self.norm = nn.GroupNorm(group_count(groups, channels), channels)
         self.query_key_value = nn.Conv2d(channels, 3 * channels, 1)
         self.project = nn.Conv2d(channels, channels, 1)
 
@@ -102,7 +102,7 @@ class AssetDecoder(nn.Module):
         )
         pairs = zip((width, *channels[:-1]), channels, strict=True)
         self.blocks = nn.ModuleList(ResidualBlock(cin, cout, groups) for cin, cout in pairs)
-        self.norm = nn.GroupNorm(_groups(groups, channels[-1]), channels[-1])
+        self.norm = nn.GroupNorm(group_count(groups, channels[-1]), channels[-1])
         self.planes = nn.Conv2d(channels[-1], 3 * plane_channels, 3, padding=1)
         scale = 2 ** (len(channels) - 1)
         self.patches = (
@@ -125,7 +125,7 @@ class AssetDecoder(nn.Module):
         return planes.reshape(len(planes), 3, self.plane_channels, *planes.shape[-2:])
 
 
-def _groups(wanted: int, channels: int) -> int:
+def group_count(wanted: int, channels: int) -> int:
     """The largest divisor of channels up to wanted that leaves two channels a group or more.
 
     A group of one channel is instance normalisation, which takes away what is constant over a plane: an

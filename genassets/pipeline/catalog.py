@@ -7,14 +7,19 @@ from collections.abc import Iterable, Mapping
 from pydantic import BaseModel
 
 from genassets.stages import (
+    evaluate_completion,
+    evaluate_generation,
     evaluate_reconstruction,
+    evaluate_sampling,
     evaluate_speed_error,
     evaluate_turns,
     export,
     filter_occlusion,
+    generate,
     ingest,
     prepare_masks,
     reconstruct,
+    train_prior,
     turntables,
 )
 from genassets.stages.stage import Stage
@@ -28,6 +33,11 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_turns.STAGE,
     turntables.STAGE,
     export.STAGE,
+    train_prior.STAGE,
+    generate.STAGE,
+    evaluate_generation.STAGE,
+    evaluate_sampling.STAGE,
+    evaluate_completion.STAGE,
     evaluate_speed_error.STAGE,
 )
 

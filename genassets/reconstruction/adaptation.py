@@ -13,7 +13,9 @@ from typing import Literal
 import numpy as np
 import pandas as pd
 import torch
+from jaxtyping import Float
 from numpy.typing import NDArray
+from torch import Tensor
 
 from genassets.errors import StageError
 from genassets.reconstruction.actor_colour import COLOUR_COLUMNS
@@ -55,22 +57,34 @@ def adapted_model(
     model = build_model(assets, logs, settings, seed)
     for name in unknown_classes(library.assets, assets):
         logger.warning("the library has no %s: their class embedding is as untrained as it was made", name)
-    frozen = {
-        name: value
-        for name, value in library.model.state_dict().items()
-        if name.partition(".")[0] not in LEARNED + OF_ACTORS
-    }
-    model.load_state_dict(model.state_dict() | frozen)
+    take_over(model, library.model)
     for name, parameter in model.named_parameters():
         parameter.requires_grad_(name.partition(".")[0] in LEARNED)
     if start != "random":
-        codes = zip(model.codes(), library.model.codes(), strict=True)
-        shares = torch.from_numpy(_shares(library.assets, assets, start)).float()
         with torch.no_grad():
-            for code, of_library in codes:
-                code.copy_(shares @ of_library)
+            for code, begun in zip(model.codes(), start_codes(library, assets, start), strict=True):
+                code.copy_(begun)
     model.refresh_coarse_distances()
     return model
+
+
+@torch.no_grad()
+def start_codes(
+    library: AssetLibrary, assets: pd.DataFrame, start: Literal["class_mean", "nearest"]
+) -> list[Float[Tensor, "assets entries"]]:
+    """Means, and log variances where the library has them, that the codes of some assets begin with."""
+    shares = torch.from_numpy(_shares(library.assets, assets, start)).float()
+    return [shares @ of_library for of_library in library.model.codes()]
+
+
+def take_over(model: AssetModel, of_library: AssetModel) -> None:
+    """Give a model a library's decoder, class embeddings, fields, sharpnesses and image network."""
+    frozen = {
+        name: value
+        for name, value in of_library.state_dict().items()
+        if name.partition(".")[0] not in LEARNED + OF_ACTORS
+    }
+    model.load_state_dict(model.state_dict() | frozen)
 
 
 def unknown_classes(library: pd.DataFrame, assets: pd.DataFrame) -> list[str]:

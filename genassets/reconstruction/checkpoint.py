@@ -9,19 +9,28 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 
 from genassets.errors import StageError
-
-if TYPE_CHECKING:
-    from genassets.reconstruction.training import Trainer
+from genassets.reconstruction.pages import Pages
 
 CHECKPOINT = "checkpoint.pt"
 
 
-def save_checkpoint(trainer: Trainer, directory: Path) -> None:
+class Resumable(Protocol):
+    """A training that can be continued from its state; pages hold what the state leaves out, where there are any."""
+
+    step: int
+    pages: Pages | None
+
+    def state(self) -> dict[str, Any]: ...
+
+    def restore(self, state: dict[str, Any]) -> None: ...
+
+
+def save_checkpoint(trainer: Resumable, directory: Path) -> None:
     """Write a checkpoint; the one before it stays until this one is whole."""
     name = None
     if trainer.pages is not None:
@@ -38,7 +47,7 @@ def save_checkpoint(trainer: Trainer, directory: Path) -> None:
             copy.unlink()
 
 
-def restore_checkpoint(trainer: Trainer, directory: Path) -> None:
+def restore_checkpoint(trainer: Resumable, directory: Path) -> None:
     """Continue from the checkpoint of a directory, where there is one.
 
     Raises:
@@ -57,6 +66,6 @@ def restore_checkpoint(trainer: Trainer, directory: Path) -> None:
         trainer.restore(state)
     except (OSError, RuntimeError, ValueError, KeyError, EOFError, UnpicklingError) as error:
         raise StageError(
-            f"{path}: cannot be continued from ({error}); expected a checkpoint of this reconstruction. "
+            f"{path}: cannot be continued from ({error}); expected a checkpoint of this training. "
             "Delete the file to train from the start."
         ) from error

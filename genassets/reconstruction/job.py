@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import pandas as pd
 from pydantic import BaseModel, ConfigDict
 
 from genassets.reconstruction.actor_colour import with_colours
 from genassets.reconstruction.adaptation import adapted_model, unknown_classes
+from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.library import load_library, make_library, save_library
+from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.pages import Pages
 from genassets.reconstruction.processes import Processes
 from genassets.reconstruction.settings import ComputeSettings, ReconstructionSettings
@@ -34,8 +38,16 @@ class Job(BaseModel):
     start: Literal["random", "class_mean", "nearest"]
     compute: ComputeSettings
 
-    def run(self, processes: Processes, progress: Progress, curve: Curve) -> dict[str, int]:
+    def run(
+        self,
+        processes: Processes,
+        progress: Progress,
+        curve: Curve,
+        pull_of: Callable[[AssetModel, pd.DataFrame], LatentPull] | None = None,
+    ) -> dict[str, int]:
         """Learn, from the last checkpoint where there is one; returns what was counted.
+
+        pull_of: the pull of a prior at the codes of a model and its table of assets, if one pulls.
 
         Every one of several processes calls this; the first writes the library into `out`.
         """
@@ -60,6 +72,7 @@ class Job(BaseModel):
             self.work_dir,
             progress,
             curve,
+            None if pull_of is None else pull_of(model, assets),
             pages=pages,
             processes=processes,
         )

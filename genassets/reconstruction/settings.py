@@ -201,3 +201,12 @@ class AdaptationSettings(_Settings):
         description="code that an actor begins with: a random one, the mean of the library's actors of its class, or "
         "that of the library's actor of its class that is nearest in size and colour",
     )
+    prior: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None,
+        description="the prior that pulls at the codes, L_rend + prior_weight L_diff: a directory, a run or an "
+        "experiment as for `library`, and learned from its codes; none: L_rend alone",
+    )
+    prior_weight: PositiveFloat = Field(default=1.0, description="lambda_diff, weight of the prior's loss")
+    prior_reuse: PositiveInt = Field(
+        default=4, description="steps of an actor that a gradient of the prior is used for"
+    )

@@ -10,10 +10,13 @@ from typing import Any
 MetricRow = Mapping[str, Any]
 """setting, split, class, metric, value, n, method."""
 
-HIGHER_IS_BETTER = ("psnr", "ssim", "iou", "f_score", "watertight", "largest_part")
+HIGHER_IS_BETTER = (
+    "psnr", "ssim", "iou", "f_score", "watertight", "largest_part", "precision", "recall", "class_recall"
+)  # fmt: skip
 LOWER_IS_BETTER = ("lpips", "chamfer", "extent_error", "fid", "kid")
 DECIMALS = {
-    "psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3, "fid": 2, "kid": 2
+    "psnr": 2, "ssim": 3, "lpips": 3, "iou": 3, "chamfer": 3, "f_score": 3, "extent_error": 3, "fid": 2, "kid": 2,
+    "precision": 3, "recall": 3, "class_recall": 3, "brightness": 3,
 }  # fmt: skip
 ARROWS = {1: " \u2191", -1: " \u2193", 0: ""}
 """Behind a heading: whether more or less is better."""
@@ -34,9 +37,14 @@ NAMES = {
     "fid": "FID",
     "kid_x1000": "KID x 1000",
     "kid_x1000_error": "its standard error",
+    "class_recall": "class recognised",
+    "class_recall_library": "of reconstructed actors",
+    "velocity_error": "error of v",
 }
 GROUP_ORDER = ("moved", "same", "all", "no_crop", "360", "seen", "unseen")
-PREDICTOR_ORDER = ("model", "nearest_crop", "mean_colour")
+PREDICTOR_ORDER = (
+    "real_crops", "library", "model", "nearest_crop", "mean_colour", "class_gaussian", "mean_code", "gaussian"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

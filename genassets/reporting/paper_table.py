@@ -1,4 +1,4 @@
-"""Runs beside each other in the layout of the paper's tables: sparse view, novel camera, 360 degrees, shape.
+"""Runs beside each other in the layout of the paper's tables: held-out views, 360 degrees, shape, generation.
 
 A row is the model of a run, or one of its trivial baselines. Everything comes from the runs' metrics; nothing is
 computed anew.
@@ -13,7 +13,16 @@ from typing import Any
 
 from genassets.reporting.metric_tables import MetricRow, better, format_value
 
-BASELINES = {"nearest_crop": "nearest crop", "mean_colour": "mean colour"}
+BASELINES = {
+    "nearest_crop": "nearest crop",
+    "mean_colour": "mean colour",
+    "library": "reconstructed (floor)",
+    "class_gaussian": "normal codes a class",
+    "mean_code": "mean code",
+    "gaussian": "N(0, 1) codes",
+}
+NO_CONTENDERS = ("library",)
+"""Lines that no best is looked for among: the actors that were reconstructed, not generated."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +49,10 @@ COLUMNS = (
     Column("360 degrees", "PSNR", "360", "all", "psnr"),
     Column("Shape", "Chamfer, m", "shape", "all", "chamfer"),
     Column("Shape", "F-score", "shape", "all", "f_score"),
+    Column("Generation", "FID", "generation", "all", "fid"),
+    Column("Generation", "KID x 1000", "generation", "all", "kid_x1000"),
+    Column("Generation", "precision", "generation", "all", "precision"),
+    Column("Generation", "recall", "generation", "all", "recall"),
 )
 
 
@@ -122,7 +135,11 @@ def best_lines(lines: Sequence[Line]) -> dict[Column, int]:
     """Index of the best line of each column in which at least two compete, over equally many samples all."""
     best: dict[Column, int] = {}
     for column in COLUMNS:
-        known = [i for i, line in enumerate(lines) if column in line.entries]
+        known = [
+            i
+            for i, line in enumerate(lines)
+            if column in line.entries and line.predictor not in NO_CONTENDERS
+        ]
         counts = {lines[i].entries[column].n for i in known}
         if len(known) > 1 and len(counts) == 1:
             sign = better(column.metric)

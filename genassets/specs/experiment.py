@@ -44,7 +44,8 @@ class ExperimentHeader(BaseModel):
     seed: int = Field(0, ge=0, lt=2**32, description="Seed of every random generator.")
     split: Split = Field(Split(), description="Which frames train and which test.")
     stages: tuple[str, ...] | None = Field(
-        None, description="Stages wanted, with what they need; default all but evaluate_speed_error."
+        None,
+        description="Stages wanted, with what they need; default all but those that are made on request.",
     )
     allowed_failed_shards: float = Field(
         0.0, ge=0.0, lt=1.0, description="Fraction of a stage's logs that may fail without stopping the run."

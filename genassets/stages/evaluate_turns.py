@@ -168,7 +168,7 @@ def _seen(path: Path, log: Log, renderer: SceneRenderer, config: EvaluateTurnsCo
     from genassets.curation.object_table import read_object_table
     from genassets.evaluation.observation_row import observation_of
     from genassets.evaluation.sparse_view import image_scale
-    from genassets.evaluation.turned_images import source_of
+    from genassets.evaluation.turned_images import library_sources
 
     rows = read_object_table(path / "objects.parquet")
     rows = rows[rows["actor_id"].isin(renderer.library.indices_of_log(log.name))]
@@ -178,12 +178,10 @@ def _seen(path: Path, log: Log, renderer: SceneRenderer, config: EvaluateTurnsCo
     trains = np.array([config.split.trains(camera, int(frame)) for camera, frame in images], dtype=bool)
     box_px = (rows["x1"] - rows["x0"]) * (rows["y1"] - rows["y0"]) * shrink
     large = (box_px >= config.least_box_px) & (rows["occluded"] <= config.max_occluded) & trains
-    whole = rows["truncation"] <= config.max_truncation
-    masked = (rows["mask_px"].astype(float) * shrink >= config.least_mask_px).fillna(False)
     return _Seen(
         large=frozenset(rows.loc[large, "actor_id"]),
         training=[observation_of(row) for row in rows[rows["kept"] & trains].itertuples(index=False)],
-        sources=[source_of(row) for row in rows[rows["kept"] & whole & masked].itertuples(index=False)],
+        sources=library_sources(rows, log, renderer, config.least_mask_px, config.max_truncation),
     )
 
 

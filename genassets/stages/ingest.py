@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.specs.log_source import LogSource, SyntheticSource
-from genassets.stages.ingested import LOG_FILE, ingested_root, open_ingested
+from genassets.stages.ingested import CONTENT_FILE, LOG_FILE, ingested_root, open_ingested
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     from genassets.driving import Log
 
 __all__ = ["STAGE", "Config", "ingested_root", "open_ingested"]
-
-CONTENT_FILE = "content.json"
 
 
 class Config(BaseModel):

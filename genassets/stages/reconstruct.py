@@ -5,13 +5,23 @@ With `adapt`, latents and backgrounds alone, for the decoder, fields and image n
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pydantic import model_validator
 
+from genassets.errors import StageError
 from genassets.reconstruction.settings import AdaptationSettings, ComputeSettings, ReconstructionSettings
 from genassets.specs.split import Split
 from genassets.stages.stage import Borrowed, Inputs, Metric, Stage, StageContext
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from genassets.reconstruction.latent_prior import LatentPull
+    from genassets.reconstruction.model import AssetModel
 
 
 class ReconstructConfig(ReconstructionSettings, ComputeSettings):
@@ -28,6 +38,10 @@ class ReconstructConfig(ReconstructionSettings, ComputeSettings):
             raise ValueError(
                 f"processes is {self.processes}, but a step has {self.views} views to share out; take more views a "
                 "step, or fewer processes"
+            )
+        if self.processes > 1 and self.adapt is not None and self.adapt.prior is not None:
+            raise ValueError(
+                f"processes is {self.processes}, but adapt.prior pulls in one process alone; take one, or no prior"
             )
         return self
 
@@ -62,14 +76,47 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
         start=config.adapt.start if config.adapt else "random",
         compute=compute,
     )
+    pull_of = None
+    if config.adapt is not None and config.adapt.prior is not None:
+        if chosen_device(compute).type != "cpu":
+            raise StageError("reconstruct.adapt.prior pulls on the CPU alone; set reconstruct.device=cpu")
+        times = {log.name: log.time_of_day for log in logs}
+        pull_of = partial(prior_pull, config.adapt, inputs.borrowed["train_prior"], times)
     if compute.processes > 1:
         counts = run_together(job, context.progress, context.curve)
     else:
-        counts = job.run(connect(compute), context.progress, context.curve)
+        counts = job.run(connect(compute), context.progress, context.curve, pull_of)
     return [
         Metric("reconstruction", "train", "all", name, value, value, "count")
         for name, value in counts.items()
     ]
+
+
+def prior_pull(
+    settings: AdaptationSettings,
+    path: Path,
+    times: Mapping[str, str],
+    model: AssetModel,
+    assets: pd.DataFrame,
+) -> LatentPull:
+    """The prior's pull at the codes of a model that is adapted; times: "day" or "night" of each log.
+
+    Raises:
+        StageError: the prior was learned from codes of another decoder.
+    """
+    from genassets.prior.conditions import Conditions
+    from genassets.prior.library_codes import decoder_digest
+    from genassets.prior.prior_file import load_prior
+    from genassets.prior.pull import DiffusionPull
+    from genassets.reconstruction.latent_prior import LatentPull
+
+    trained = load_prior(path)
+    trained.check_decoder(decoder_digest(model), f"reconstruct.adapt.prior, {path}")
+    conditions = Conditions.of(
+        [str(name) for name in assets["actor_class"]], [times[str(log)] for log in assets["log"]]
+    )
+    pull = DiffusionPull(trained.model, model.sizes, conditions)
+    return LatentPull(pull, settings.prior_weight, settings.prior_reuse)
 
 
 def needed_files(config: ReconstructConfig) -> dict[str, str]:
@@ -78,10 +125,13 @@ def needed_files(config: ReconstructConfig) -> dict[str, str]:
 
 
 def borrowed_library(config: ReconstructConfig) -> tuple[Borrowed, ...]:
-    """The library that is adapted, if one is."""
+    """The library that is adapted, if one is, and the prior that pulls at its codes."""
     if config.adapt is None:
         return ()
-    return (Borrowed("reconstruct", "reconstruct.adapt.library", config.adapt.library),)
+    library = Borrowed("reconstruct", "reconstruct.adapt.library", config.adapt.library)
+    if config.adapt.prior is None:
+        return (library,)
+    return (library, Borrowed("train_prior", "reconstruct.adapt.prior", config.adapt.prior))
 
 
 STAGE = Stage(
@@ -90,6 +140,14 @@ STAGE = Stage(
     config=ReconstructConfig,
     needs=("ingest",),
     modules=(
+        "genassets.prior.conditions",
+        "genassets.prior.library_codes",
+        "genassets.prior.model",
+        "genassets.prior.network",
+        "genassets.prior.prior_file",
+        "genassets.prior.pull",
+        "genassets.prior.schedule",
+        "genassets.prior.settings",
         "genassets.reconstruction",
         "genassets.rendering",
         "genassets.fields",

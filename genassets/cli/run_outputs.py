@@ -1,0 +1,32 @@
+"""Outputs of finished runs that commands read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from genassets.errors import StageError
+from genassets.pipeline.run_record import RunRecord, find_run, list_runs
+
+
+def outputs_of(record: RunRecord, stage: str, advice: str) -> dict[str, Path]:
+    """Where a run's record says that a stage's outputs lie, by shard.
+
+    Raises:
+        StageError: it made none; the message ends with the advice.
+    """
+    steps = [step for step in record.stages if step.name == stage]
+    found = {step.shard or "": Path(step.path) for step in steps if step.path and Path(step.path).is_dir()}
+    if not found or len(found) < len(steps):
+        raise StageError(f"{record.directory}: the run has no output of {stage}; {advice}")
+    return found
+
+
+def run_of(runs: Path, name: str | None, stage: str) -> RunRecord:
+    """The newest run of an experiment that completed a stage, else a run by id or its start, the newest for None."""
+    for path in reversed(list_runs(runs) if name else []):
+        record = RunRecord.load(path)
+        if record.experiment == name and any(
+            s.name == stage and s.status == "completed" for s in record.stages
+        ):
+            return record
+    return RunRecord.load(find_run(runs, name))
