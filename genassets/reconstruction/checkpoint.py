@@ -47,8 +47,10 @@ def save_checkpoint(trainer: Resumable, directory: Path) -> None:
             copy.unlink()
 
 
-def restore_checkpoint(trainer: Resumable, directory: Path) -> None:
-    """Continue from the checkpoint of a directory, where there is one.
+def restore_checkpoint(
+    trainer: Resumable, directory: Path, device: torch.device = torch.device("cpu")
+) -> None:
+    """Continue from the checkpoint of a directory, where there is one, on the device that the training is on.
 
     Raises:
         StageError: the checkpoint cannot be read, or is one of another training.
@@ -57,7 +59,7 @@ def restore_checkpoint(trainer: Resumable, directory: Path) -> None:
     if not path.exists():
         return
     try:
-        state: dict[str, Any] = torch.load(path, trainer.processes.device, weights_only=True)
+        state: dict[str, Any] = torch.load(path, device, weights_only=True)
         name = state.pop("pages")
         if (name is None) != (trainer.pages is None):
             raise ValueError("it was written with pages" if name else "it was written without pages")

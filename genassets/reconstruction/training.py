@@ -325,7 +325,7 @@ def train(
     Of several processes the first alone writes checkpoints, and says what comes of steps.
     """
     trainer = Trainer(model, data, settings, seed, pull, pages=pages, processes=processes)
-    restore_checkpoint(trainer, work_dir)
+    restore_checkpoint(trainer, work_dir, trainer.processes.device)
     while trainer.step < settings.steps:
         result = trainer.advance()
         if processes.rank:
