@@ -10,6 +10,7 @@ import pandas as pd
 import pytest
 import torch
 from guided import SHOT, TINY_LOSS, library_beside, objects_of, tiny_task
+from pydantic import ValidationError
 from tiny_log import MOVING, PARKED, WALKER
 from tiny_prior import TINY, learn
 
@@ -30,7 +31,7 @@ from genassets.prior.library_codes import decoder_digest, library_codes
 from genassets.prior.model import AssetPrior
 from genassets.prior.prior_file import save_prior
 from genassets.prior.settings import SamplingSettings
-from genassets.reconstruction.library import load_library, save_library
+from genassets.reconstruction.library import AssetLibrary, load_library, save_library
 from genassets.reconstruction.scene import scene_frame
 from genassets.reconstruction.settings import AdaptationSettings
 from genassets.stages import evaluate_completion, reconstruct
@@ -261,8 +262,10 @@ def test_a_prior_pulls_while_codes_are_adapted(prior: AssetPrior, tmp_path: Path
         ("train_prior", "reconstruct.adapt.prior", "toy"),
     ]
     library = library_beside()
+    with pytest.raises(ValidationError, match="adapt.prior pulls in one process alone"):
+        reconstruct.ReconstructConfig(adapt=settings, processes=2, views=2)
     save_prior(prior, decoder_digest(library.model), tmp_path)
-    pull = reconstruct.prior_pull(settings, tmp_path, library.model, library.assets, {"other": "night"})
+    pull = reconstruct.prior_pull(settings, tmp_path, {"other": "night"}, library.model, library.assets)
     assert (pull.weight, pull.reuse) == (0.5, 3)
     codes = library.model.latents(torch.arange(4)).mean.detach()
     gradient = pull.gradients(torch.arange(4), codes, torch.Generator().manual_seed(0))
@@ -270,7 +273,7 @@ def test_a_prior_pulls_while_codes_are_adapted(prior: AssetPrior, tmp_path: Path
     with torch.no_grad():
         library.model.class_embedding += 1  # type: ignore[operator]
     with pytest.raises(StageError, match="codes of another decoder"):
-        reconstruct.prior_pull(settings, tmp_path, library.model, library.assets, {"other": "night"})
+        reconstruct.prior_pull(settings, tmp_path, {"other": "night"}, library.model, library.assets)
 
 
 def test_the_evaluation_needs_a_library_and_truth(log: Log, tmp_path: Path) -> None:

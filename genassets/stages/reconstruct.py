@@ -78,7 +78,7 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
     )
     pull_of = None
     if config.adapt is not None and config.adapt.prior is not None:
-        if chosen_device(compute).type != "cpu":
+        if chosen_device(compute) != "cpu":
             raise StageError("reconstruct.adapt.prior pulls on the CPU alone; set reconstruct.device=cpu")
         times = {log.name: log.time_of_day for log in logs}
         pull_of = partial(prior_pull, config.adapt, inputs.borrowed["train_prior"], times)
