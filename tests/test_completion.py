@@ -237,7 +237,7 @@ def test_the_command_completes_from_a_run(
     assert out.parent == directory / "completed"
     assert {path.name for path in out.iterdir()} >= {"config.json", "completion.png", "completion.json"}
     assert list(load_library(out).assets["actor_id"]) == [PARKED]
-    with pytest.raises(SpecError, match="is there already"):
+    with pytest.raises(SpecError, match="exists; name a folder"):
         complete_command(log.name, [PARKED], frames="1", **options)  # type: ignore[arg-type]
     with pytest.raises(SpecError, match="nearest: "):
         complete_command(log.name, ["nobody"], run="toy")

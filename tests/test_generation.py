@@ -87,9 +87,9 @@ def test_generation_leaves_a_library_beside_its_nearest_neighbours(inputs: Input
     assert {"between_samples", "between_library_actors", "to_nearest_actor", "copies"} <= found.keys()
     made = load_library(tmp_path)
     assert set(made.assets["actor_class"]) == {"Truck"}
-    neighbours = pd.read_parquet(tmp_path / "neighbours.parquet")
     known = make_library().assets["actor_id"]
-    assert set(neighbours["nearest_actor_id"]) <= set(known)
+    assert set(made.assets["nearest_actor_id"]) <= set(known)
+    assert set(made.assets["seed"]) == {7} and (made.assets["nearest_distance"] > 0).all()
     assert (tmp_path / "pictures" / "samples.png").is_file()
 
 
@@ -128,7 +128,7 @@ def test_the_command_generates_from_a_run(
     assert said["path"] == str(directory / "generated" / "car-night-seed7")
     assert [actor["time_of_day"] for actor in said["actors"]] == ["night", "night"]
     assert len(load_library(Path(said["path"])).assets) == 2
-    with pytest.raises(SpecError, match="is there already"):
+    with pytest.raises(SpecError, match="exists; name a folder"):
         generate_command("toy", seed=7, **options)  # type: ignore[arg-type]
     with pytest.raises(SpecError, match="Tram"):
         generate_command("toy", actor_class="Tram")

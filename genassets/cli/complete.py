@@ -79,7 +79,7 @@ def complete(
 
     from PIL import Image
 
-    from genassets.cli.run_outputs import outputs_of, run_of
+    from genassets.cli.run_outputs import appears_whole, outputs_of, run_of
     from genassets.completion.complete import complete as complete_task
     from genassets.completion.complete import completion_task
     from genassets.completion.observations import actor_rows, choose_shots, choose_sweeps
@@ -118,32 +118,31 @@ def complete(
         "boxes left out",
         err=True,
     )
-    made = complete_task(task, trained.model, settings, seed, _say)
     name = "-".join([log, *(actor_id[:8] for actor_id in ids), f"seed{seed}"])
     directory = out or record.directory / FOLDER / name
-    if directory.exists() and any(directory.iterdir()):
-        raise SpecError(f"{directory} is there already; name another one with --out, or remove it")
-    completed = task.completed(made.codes)
-    save_library(completed, directory)
-    sheet = completion_sheet(task, completed, open_truth(opened.root), resolution)
-    Image.fromarray(sheet).save(directory / "completion.png")
-    document = {
-        "path": str(directory),
-        "run_id": record.run_id,
-        "log": log,
-        "actors": ids,
-        "images": [{"camera": shot.camera, "frame": shot.frame} for shot in shots],
-        "sweeps": sweeps,
-        "lidar_points": task.observed.points,
-        "lidar_points_outside": task.observed.points_outside,
-        "surroundings": task.surroundings,
-        "seed": seed,
-        "settings": settings.model_dump(mode="json"),
-        "seconds": made.seconds,
-        "loss": made.terms,
-    }
-    text = json.dumps(document, indent=1)
-    (directory / "completion.json").write_text(text + "\n", encoding="utf-8")
+    with appears_whole(directory) as partial:
+        made = complete_task(task, trained.model, settings, seed, _say)
+        completed = task.completed(made.codes)
+        save_library(completed, partial)
+        sheet = completion_sheet(task, completed, open_truth(opened.root), resolution)
+        Image.fromarray(sheet).save(partial / "completion.png")
+        document = {
+            "path": str(directory),
+            "run_id": record.run_id,
+            "log": log,
+            "actors": ids,
+            "images": [{"camera": shot.camera, "frame": shot.frame} for shot in shots],
+            "sweeps": sweeps,
+            "lidar_points": task.observed.points,
+            "lidar_points_outside": task.observed.points_outside,
+            "surroundings": task.surroundings,
+            "seed": seed,
+            "settings": settings.model_dump(mode="json"),
+            "seconds": made.seconds,
+            "loss": made.terms,
+        }
+        text = json.dumps(document, indent=1)
+        (partial / "completion.json").write_text(text + "\n", encoding="utf-8")
     if as_json:
         typer.echo(text)
         return

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,10 +13,9 @@ from genassets.cli.run import AsJson
 if TYPE_CHECKING:
     import pandas as pd
 
-    from genassets.pipeline.run_record import RunRecord
-
 FOLDER = "export"
 NEEDED = ("ingest", "filter_occlusion", "evaluate_reconstruction", "reconstruct")
+ADVICE = "expected a run that evaluated its actors. Finish it with `genassets resume`, or name another one."
 
 
 def export(
@@ -57,9 +55,9 @@ def export(
 
     from pydantic import ValidationError
 
+    from genassets.cli.run_outputs import appears_whole, outputs_of, run_of
     from genassets.errors import SpecError, StageError
     from genassets.pipeline.home import Home
-    from genassets.pipeline.run_record import RunRecord
     from genassets.reporting.gallery import GalleryTitle, write_gallery
     from genassets.stages.export import LIBRARY_STAGES, ExportConfig, export_libraries
     from genassets.stages.stage import Inputs
@@ -70,23 +68,19 @@ def export(
         raise SpecError(
             f"--format {formats!r}: {error.errors()[0]['msg']}, with commas between them"
         ) from error
-    directory = _find(Home.from_environment().runs, run)
-    record = RunRecord.load(directory)
-    folder = out or directory / FOLDER
-    if out is not None and out.exists():
-        raise SpecError(f"--out {out}: exists; name a folder that does not, or remove it")
-    generated = [stage for stage in LIBRARY_STAGES if stage not in NEEDED and _has(record, stage)]
-    inputs = Inputs({stage: _outputs(record, stage) for stage in (*NEEDED, *generated)})
-    partial = folder.parent / f".{folder.name}-partial"
-    shutil.rmtree(partial, ignore_errors=True)
+    record = run_of(Home.from_environment().runs, run, "evaluate_reconstruction")
+    folder = out or record.directory / FOLDER
+    made = {step.name for step in record.stages if step.status == "completed"}
+    libraries = [stage for stage in LIBRARY_STAGES if stage in made and stage not in NEEDED]
+    inputs = Inputs({stage: outputs_of(record, stage, ADVICE) for stage in (*NEEDED, *libraries)})
     chosen: set[str] = set()
-    try:
+    with appears_whole(folder, replace=out is None) as partial:
         cards, skipped = export_libraries(
             inputs,
             config,
             partial,
             lambda assets: _rows(assets, actors or [], classes or [], chosen),
-            seed=_seed(directory),
+            seed=_seed(record.directory),
             run_id=record.run_id,
             progress=lambda done, total, message: typer.echo(f"  {done}/{total} {message}", err=True),
         )
@@ -103,10 +97,6 @@ def export(
                 )
             )
         write_gallery(partial, partial, GalleryTitle(record.experiment, record.run_id, None))
-        shutil.rmtree(folder, ignore_errors=True)  # only the run's own folder can be there
-        partial.rename(folder)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
     for row in skipped:
         typer.echo(f"left out: {row['reason']}", err=True)
     page = folder / "index.html"
@@ -116,34 +106,6 @@ def export(
         typer.echo(json.dumps(document | {"actors": names, "skipped": skipped}, indent=1))
     else:
         typer.echo(f"{len(cards)} actors\n{page}")
-
-
-def _find(runs: Path, name: str | None) -> Path:
-    """The newest run of an experiment that has what an export reads, else a run by id or its start."""
-    from genassets.pipeline.run_record import RunRecord, find_run, list_runs
-
-    for path in reversed(list_runs(runs) if name else []):
-        record = RunRecord.load(path)
-        if record.experiment == name and all(_has(record, stage) for stage in NEEDED):
-            return path
-    return find_run(runs, name)
-
-
-def _has(record: RunRecord, stage: str) -> bool:
-    steps = [step for step in record.stages if step.name == stage]
-    return bool(steps) and all(step.path and Path(step.path).is_dir() for step in steps)
-
-
-def _outputs(record: RunRecord, stage: str) -> dict[str, Path]:
-    """Where a stage's outputs lie, by shard; StageError where the run has none."""
-    from genassets.errors import StageError
-
-    if not _has(record, stage):
-        raise StageError(
-            f"{record.directory}: the run has no output of {stage}; expected a run that went through {NEEDED[2]}. "
-            f"Finish it with `genassets resume {record.run_id}`, or name another one."
-        )
-    return {step.shard or "": Path(str(step.path)) for step in record.stages if step.name == stage}
 
 
 def _seed(directory: Path) -> int:

@@ -47,8 +47,7 @@ def generate(
     """Generate actors: a library as reconstruction leaves one, with pictures beside the nearest known actors."""
     import json
 
-    from genassets.cli.run_outputs import outputs_of, run_of
-    from genassets.errors import SpecError
+    from genassets.cli.run_outputs import appears_whole, outputs_of, run_of
     from genassets.pipeline.home import Home
     from genassets.specs.document import parse_document
     from genassets.specs.validation import validate
@@ -72,30 +71,26 @@ def generate(
     )
     name = "-".join([*(actor_class or "any").lower().split(), time or "any", f"seed{seed}"])
     directory = out or record.directory / FOLDER / name
-    if directory.exists() and any(directory.iterdir()):
-        raise SpecError(f"{directory} is there already; name another one with --out, or remove it")
-    directory.mkdir(parents=True, exist_ok=True)
-    made = stage.generate(
-        library[""],
-        prior[""],
-        times_of_day(ingested.values()),
-        config,
-        seed,
-        directory,
-        lambda done, total, message: typer.echo(f"  {message}", err=True),
-    )
+    with appears_whole(directory) as partial:
+        made = stage.generate(
+            library[""],
+            prior[""],
+            times_of_day(ingested.values()),
+            config,
+            seed,
+            partial,
+            lambda done, total, message: typer.echo(f"  {message}", err=True),
+        )
     rows = [metric.row() for metric in stage.metrics(made, config)]
     if as_json:
-        actors = made.library.assets.merge(made.neighbours, on="actor_id").to_dict("records")
+        actors = made.library.assets.to_dict("records")
         typer.echo(json.dumps({"path": str(directory), "actors": actors, "metrics": rows}, indent=1))
         return
-    for asset, beside in zip(
-        made.library.assets.to_dict("records"), made.neighbours.to_dict("records"), strict=True
-    ):
+    for asset in made.library.assets.to_dict("records"):
         size = " x ".join(f"{asset[key]:.2f}" for key in ("size_l", "size_w", "size_h"))
         typer.echo(
-            f"{asset['actor_id']:<40}{size + ' m':<22}nearest {beside['nearest_class']} "
-            f"{beside['nearest_actor_id'][:8]} at {beside['distance']:.2f}"
+            f"{asset['actor_id']:<40}{size + ' m':<22}nearest {asset['nearest_class']} "
+            f"{asset['nearest_actor_id'][:8]} at {asset['nearest_distance']:.2f}"
         )
     for row in rows:
         typer.echo(f"{row['metric']:<28}{row['value']:>10.3f}")

@@ -1,10 +1,13 @@
-"""Outputs of finished runs that commands read."""
+"""Outputs of finished runs that commands read, and folders that commands write."""
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from genassets.errors import StageError
+from genassets.errors import SpecError, StageError
 from genassets.pipeline.run_record import RunRecord, find_run, list_runs
 
 
@@ -30,3 +33,25 @@ def run_of(runs: Path, name: str | None, stage: str) -> RunRecord:
         ):
             return record
     return RunRecord.load(find_run(runs, name))
+
+
+@contextmanager
+def appears_whole(directory: Path, replace: bool = False) -> Iterator[Path]:
+    """A folder to write into, which becomes `directory` at the end; after an error nothing of it is left.
+
+    replace: whether what lies at `directory` gives way.
+
+    Raises:
+        SpecError: `directory` is there already, and must not give way.
+    """
+    if directory.exists() and not replace:
+        raise SpecError(f"{directory}: exists; name a folder that does not with --out, or remove it")
+    partial = directory.parent / f".{directory.name}-partial"
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        shutil.rmtree(directory, ignore_errors=True)
+        partial.rename(directory)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)

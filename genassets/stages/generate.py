@@ -1,12 +1,12 @@
 """Stage generate: new actors from the prior, as an asset library; genassets generate does the same for any run.
 
-Writes the files of an asset library (log "generated") and neighbours.parquet: the nearest actor that was learned from.
+Writes the files of an asset library (log "generated"), whose table names the nearest actor that was learned from.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +16,6 @@ from genassets.prior.settings import ClassName, SamplingSettings, TimeOfDay
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from genassets.prior.diversity import Diversity
     from genassets.reconstruction.library import AssetLibrary
 
@@ -42,10 +40,11 @@ class GenerateConfig(SamplingSettings):
 
 @dataclass(frozen=True)
 class Generated:
-    """A generated library with its nearest neighbours in the one that was learned from, and what was counted."""
+    """A generated library, and what was counted. Its table has the columns seed, nearest_log, nearest_actor_id,
+    nearest_class and nearest_distance besides: the nearest actor of the library that was learned from.
+    """
 
     library: AssetLibrary
-    neighbours: pd.DataFrame
     diversity: Diversity
     clamped_sizes: int
     unseen_together: int
@@ -79,8 +78,6 @@ def generate(
     """
     import time
 
-    import pandas as pd
-
     from genassets.prior.diversity import diversity, nearest
     from genassets.prior.generated_library import generated_library
     from genassets.prior.library_codes import library_codes
@@ -102,26 +99,23 @@ def generate(
     )
     made = generated_library(learned, samples, seed)
     seconds = time.perf_counter() - begun
-    save_library(made.library, out)
     found = nearest(model, samples, codes)
-    neighbours = pd.DataFrame(
-        {
-            "actor_id": made.library.assets["actor_id"],
-            "nearest_log": learned.assets["log"].to_numpy()[found.row],
-            "nearest_actor_id": learned.assets["actor_id"].to_numpy()[found.row],
-            "nearest_class": learned.assets["actor_class"].to_numpy()[found.row],
-            "distance": found.distance,
-        }
+    beside = learned.assets.iloc[found.row].reset_index(drop=True)
+    assets = made.library.assets.assign(
+        seed=seed,
+        nearest_log=beside["log"],
+        nearest_actor_id=beside["actor_id"],
+        nearest_class=beside["actor_class"],
+        nearest_distance=found.distance,
     )
-    neighbours.to_parquet(out / "neighbours.parquet", index=False)
     generated = Generated(
-        made.library,
-        neighbours,
+        replace(made.library, assets=assets),
         diversity(model, samples, codes),
         made.clamped_sizes,
         unseen_together(model, conditions),
         seconds,
     )
+    save_library(generated.library, out)
     if config.pictured:
         _picture(
             generated, learned, config, out, lambda done: progress(config.count + done, total, "pictures")
@@ -131,7 +125,7 @@ def generate(
 
 def metrics(made: Generated, config: GenerateConfig) -> list[Metric]:
     """What was counted and measured."""
-    n = len(made.neighbours)
+    n = len(made.library.assets)
     how = f"{config.solver}, {config.steps} steps, guidance {config.guidance:g}"
     counts = {"actors": n, "clamped_sizes": made.clamped_sizes, "unseen_together": made.unseen_together}
     rows = [Metric("generated", "all", "all", name, value, value, "count") for name, value in counts.items()]
@@ -176,17 +170,17 @@ def _picture(
 
     new, known = SceneRenderer(made.library), SceneRenderer(learned)
     rows = []
-    assets = made.library.assets.to_dict("records")[: config.pictured]
-    for number, (asset, beside) in enumerate(zip(assets, made.neighbours.to_dict("records"), strict=False)):
+    assets = made.library.assets.to_dict("records")
+    for number, asset in enumerate(assets[: config.pictured]):
         say(2 * number)
-        named = f"{beside['nearest_class']} {beside['nearest_actor_id'][:8]} of log {beside['nearest_log']}"
+        named = f"{asset['nearest_class']} {asset['nearest_actor_id'][:8]} of log {asset['nearest_log']}"
         size = " x ".join(f"{asset[name]:.1f}" for name in ("size_l", "size_w", "size_h"))
         caption = (
             f"{asset['actor_class']} {asset['time_of_day']}, sample {asset['sample']}, {size} m; "
-            f"nearest: {named} at {beside['distance']:.2f}"
+            f"nearest: {named} at {asset['nearest_distance']:.2f}"
         )
         panels = turned(new, LOG, asset["actor_id"])
-        panels += turned(known, beside["nearest_log"], beside["nearest_actor_id"])
+        panels += turned(known, asset["nearest_log"], asset["nearest_actor_id"])
         rows.append(PictureRow(caption, panels))
     pictures = PictureList(out)
     headings = [f"{kind} {azimuth:g}" for kind in ("sample", "nearest") for azimuth in AZIMUTHS]
@@ -196,7 +190,7 @@ def _picture(
         picture_sheet(headings, rows, panel=(config.resolution, config.resolution)),
         "Generated actors and the nearest ones that were learned from",
         f"Distances are the {DISTANCE}: a draw of an actor's own posterior lies at {found.redrawn:.2f}, "
-        f"{found.copies} of {len(made.neighbours)} samples are that near to one.",
+        f"{found.copies} of {len(assets)} samples are that near to one.",
     )
     pictures.write()
 
