@@ -186,8 +186,9 @@ def run_and_wait_to_be_killed(root: Path, directory: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_in_the_middle_two_processes_go_on_to_the_same_numbers(
-    log: Log, tmp_path: Path, alone: Outcome
+@pytest.mark.parametrize("then", [2, 1])
+def test_killed_in_the_middle_two_processes_or_one_go_on_to_the_same_numbers(
+    log: Log, tmp_path: Path, alone: Outcome, then: int
 ) -> None:
     """SIGKILL of the process that started them: they have to end by themselves, and to leave a checkpoint whole."""
     first = multiprocessing.get_context("spawn").Process(
@@ -201,7 +202,7 @@ def test_killed_in_the_middle_two_processes_go_on_to_the_same_numbers(
     first.join()
     assert first.exitcode == -signal.SIGKILL
     assert (tmp_path / "checkpoint.pt").exists()
-    job = job_of(log, tmp_path, 2)
+    job = job_of(log, tmp_path, then)
     curves, counts, library = outcome(job)
     assert min(step for _, step in curves) >= 40  # from a checkpoint, not from the start
     assert counts == alone[1]

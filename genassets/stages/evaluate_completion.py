@@ -18,7 +18,7 @@ from genassets.prior.guidance_settings import (
     Variant,
 )
 from genassets.prior.settings import SamplingSettings
-from genassets.stages.stage import Borrowed, Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Borrowed, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -232,14 +232,8 @@ STAGE = Stage(
         "genassets.masks",
         "genassets.export",
         "genassets.prior",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

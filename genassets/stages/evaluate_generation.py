@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
+from genassets.evaluation.source_settings import SourceSettings
 from genassets.prior.settings import SamplingSettings
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,27 +36,9 @@ LIBRARY, MODEL = "library", "model"
 """Sets of actors: the reconstructed ones (the floor), those of the prior. The others are prior.baselines."""
 
 
-class EvaluateGenerationConfig(SamplingSettings):
+class EvaluateGenerationConfig(SourceSettings, SamplingSettings):
     """Settings of the evaluation of generated actors, and how they are sampled."""
 
-    images: int = Field(
-        default=500,
-        ge=2,
-        description="Real crops, and renders of each set of actors, at most; drawn with the seed.",
-    )
-    least_images: int = Field(
-        default=16, ge=8, description="With fewer real crops nothing is compared, and a count says so."
-    )
-    least_mask_px: int = Field(
-        default=100, ge=1, description="Mask pixels, at the size that is rendered, of a real crop."
-    )
-    max_truncation: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="Part of a real actor's box, turned or not, that may lie outside the image.",
-    )
-    crop_margin: float = Field(default=0.1, ge=0, description="Context around the box, of its longer side.")
     pictured: int = Field(default=8, ge=0, description="Places in the picture sheet.")
 
 
@@ -345,14 +328,8 @@ STAGE = Stage(
         "genassets.masks",
         "genassets.export",
         "genassets.prior",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.errors import StageError
 from genassets.specs.split import Split
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -299,13 +299,7 @@ STAGE = Stage(
         "genassets.curation",
         "genassets.masks",
         "genassets.export",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.prior.settings import PositiveInt
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 MEASURES = ("seconds", "psnr_to_exact", "distance", "distance_error")
 
@@ -103,14 +103,8 @@ STAGE = Stage(
         "genassets.evaluation",
         "genassets.export",
         "genassets.prior",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from genassets.evaluation.source_settings import SourceSettings
 from genassets.specs.split import Split
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -29,10 +30,8 @@ if TYPE_CHECKING:
 SHAPE_MEASURES = ("has_surface", "watertight", "largest_part", "extent_error", "chamfer", "f_score")
 
 
-class EvaluateTurnsConfig(BaseModel):
+class EvaluateTurnsConfig(SourceSettings):
     """Settings of the 360 degree evaluation."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     split: Split = Split()
     least_box_px: float = Field(
@@ -52,26 +51,6 @@ class EvaluateTurnsConfig(BaseModel):
     )
     lpips: bool = Field(default=True, description="Measure LPIPS; needs the pretrained file lpips-alexnet.")
     fid: bool = Field(default=True, description="Measure FID and KID; needs the pretrained file inception.")
-    images: int = Field(
-        default=500,
-        ge=2,
-        description="Source crops, and turned renders, that FID and KID compare at most; drawn with the seed.",
-    )
-    least_images: int = Field(
-        default=16,
-        ge=2,
-        description="With fewer source crops there is neither FID nor KID, and a count says so.",
-    )
-    least_mask_px: int = Field(
-        default=100, ge=1, description="Mask pixels, at the size that is rendered, of a source crop."
-    )
-    max_truncation: float = Field(
-        default=0.1,
-        ge=0,
-        le=1,
-        description="Part of a source's box, turned or not, that may lie outside the image.",
-    )
-    crop_margin: float = Field(default=0.1, ge=0, description="Context around the box, of its longer side.")
     sdf_resolution: int = Field(64, ge=16, le=512, description="Grid points a side for the surface mesh.")
     pictured: int = Field(
         default=4, ge=0, description="Actors in each sheet of true turns, and sources in the sheet of crops."
@@ -300,14 +279,8 @@ STAGE = Stage(
         "genassets.curation",
         "genassets.masks",
         "genassets.export",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -329,14 +329,8 @@ STAGE = Stage(
         "genassets.export",
         "genassets.curation",
         "genassets.masks",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

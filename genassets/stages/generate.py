@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from genassets.prior.settings import ClassName, SamplingSettings, TimeOfDay
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     from genassets.prior.diversity import Diversity
@@ -202,16 +202,10 @@ STAGE = Stage(
     needs=("ingest", "reconstruct", "train_prior"),
     modules=(
         "genassets.prior",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.evaluation",
         "genassets.export",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

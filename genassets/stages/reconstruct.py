@@ -15,7 +15,7 @@ from pydantic import model_validator
 from genassets.errors import StageError
 from genassets.reconstruction.settings import AdaptationSettings, ComputeSettings, ReconstructionSettings
 from genassets.specs.split import Split
-from genassets.stages.stage import Borrowed, Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Borrowed, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -148,13 +148,7 @@ STAGE = Stage(
         "genassets.prior.pull",
         "genassets.prior.schedule",
         "genassets.prior.settings",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,

@@ -15,6 +15,17 @@ from typing import Any
 
 from pydantic import BaseModel
 
+MODEL_CODE = (
+    "genassets.reconstruction",
+    "genassets.rendering",
+    "genassets.fields",
+    "genassets.driving",
+    "genassets.geometry",
+    "genassets.perceptual",
+    "genassets.weights",
+)
+"""The modules of a stage that learns or renders an asset library; see Stage.modules."""
+
 
 @dataclass(frozen=True)
 class Metric:

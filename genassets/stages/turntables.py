@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -131,14 +131,8 @@ STAGE = Stage(
     modules=(
         "genassets.export",
         "genassets.evaluation",
-        "genassets.reconstruction",
-        "genassets.rendering",
-        "genassets.fields",
-        "genassets.driving",
-        "genassets.geometry",
-        "genassets.perceptual",
-        "genassets.weights",
         "genassets.stages.ingested",
+        *MODEL_CODE,
     ),
     run=run,
     sharded=False,
