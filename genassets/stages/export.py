@@ -242,7 +242,7 @@ def _subjects(
         distance = asset.get("nearest_distance")
         subjects.append(
             Subject(
-                name=f"generated_{names[row]}" if made else names[row],
+                name=names[row],
                 log=key[0],
                 actor_id=key[1],
                 actor_class=str(asset["actor_class"]),
