@@ -1,0 +1,1 @@
+"""Changed logs: actors swapped, turned, removed and inserted, in images, sweeps and labels alike."""

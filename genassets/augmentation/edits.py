@@ -1,0 +1,35 @@
+"""What is changed in a log: a list of edits, each of which takes an actor out, puts an asset in, or both."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from genassets.driving.log import Track
+
+
+@dataclass(frozen=True)
+class PlacedAsset:
+    """An asset of a library that stands in a log.
+
+    row: its row in the library's table. track: where it is at each frame, in the log's world; its actor_id is new to the
+    log, its size that at which the asset is drawn, in metres.
+    """
+
+    row: int
+    track: Track
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One change of a log, the same over all frames.
+
+    removed: the log's own actor that goes. placed: the asset that comes. A swap has both, at the same ground contact;
+    a turned actor is removed and placed with its own asset.
+    """
+
+    removed: Track | None
+    placed: PlacedAsset | None
+
+    def __post_init__(self) -> None:
+        if self.removed is None and self.placed is None:
+            raise ValueError("an edit has to remove an actor, place an asset, or both")
