@@ -10,11 +10,12 @@ from pathlib import Path
 import pytest
 
 from genassets.pipeline.catalog import CATALOG
-from genassets.pipeline.code_digest import WITHOUT_EFFECT, code_digest_of, code_tree
+from genassets.pipeline.code_digest import WITHOUT_EFFECT, CodeRoots, code_digest_of, code_trees
 from genassets.pipeline.file_digests import FileMemory, sha256_of
 from genassets.pipeline.fingerprint import canonical_json, differences, fingerprint, numeric_environment
 from genassets.pipeline.plan import Step
 from genassets.pipeline.source_digest import source_digest
+from genassets.stages import reconstruct
 from tests.toy_pipeline import NUMBERS, TOTAL, toy_workflow
 
 SOURCE_ROOT = Path(__file__).resolve().parents[1]
@@ -75,6 +76,10 @@ def test_code_digest_ignores_comments_docstrings_and_layout() -> None:
     assert code_digest_of("f('a')") != code_digest_of("f('b')")
 
 
+def reached(roots: CodeRoots, source_root: Path, memory: FileMemory) -> dict[str, str]:
+    return code_trees([roots], source_root, memory)[roots]
+
+
 def write_package(root: Path) -> None:
     (root / "genassets" / "inner").mkdir(parents=True)
     files = {
@@ -94,9 +99,11 @@ def write_package(root: Path) -> None:
 def test_code_tree_follows_lazy_relative_and_package_imports(tmp_path: Path) -> None:
     write_package(tmp_path)
     with FileMemory(tmp_path / "memory.json") as memory:
-        tree = code_tree(["genassets.top"], tmp_path, memory)
+        tree = reached(CodeRoots(("genassets.top",)), tmp_path, memory)
+        ended = reached(CodeRoots(("genassets.top",), frozenset({"genassets.inner.deep"})), tmp_path, memory)
     names = ["genassets.inner", "genassets.inner.deep", "genassets.inner.relative", "genassets.inner.sibling"]
     assert list(tree) == [*names, "genassets.top"]
+    assert list(ended) == ["genassets.top"]
 
 
 def test_code_memory_sees_an_edit(tmp_path: Path) -> None:
@@ -105,7 +112,7 @@ def test_code_memory_sees_an_edit(tmp_path: Path) -> None:
     for text in ("", "A = 1", "A = 1  # same", "A = 2"):
         (tmp_path / "genassets/inner/sibling.py").write_text(text)
         with FileMemory(tmp_path / "memory.json") as memory:
-            trees.append(code_tree(["genassets.top"], tmp_path, memory))
+            trees.append(reached(CodeRoots(("genassets.top",)), tmp_path, memory))
     assert trees[0] != trees[1]
     assert trees[1] == trees[2]
     assert trees[2] != trees[3]
@@ -118,10 +125,23 @@ def test_declared_modules_are_the_imported_ones(stage: object, tmp_path: Path) -
     module = inspect.getmodule(stage.run)  # type: ignore[attr-defined]
     assert isinstance(module, types.ModuleType)
     with FileMemory(tmp_path / "memory.json") as memory:
-        tree = code_tree([module.__name__], SOURCE_ROOT, memory)
+        tree = reached(CodeRoots((module.__name__,), frozenset(stage.code_when)), SOURCE_ROOT, memory)  # type: ignore[attr-defined]
     imported = {".".join(name.split(".")[:2]) for name in tree if name not in WITHOUT_EFFECT}
     settings = {"genassets.specs", "genassets.stages"}
     assert declared - settings == imported - settings
+
+
+def test_the_prior_counts_as_code_of_a_reconstruction_that_it_pulls_at_alone(tmp_path: Path) -> None:
+    counts = reconstruct.STAGE.code_when["genassets.stages.prior_pull"]
+    pulled = {"adapt": {"library": "demo", "prior": "demo"}}
+    for fields, expected in (({}, False), ({"adapt": {"library": "demo"}}, False), (pulled, True)):
+        assert counts(reconstruct.ReconstructConfig.model_validate(fields)) == expected
+    begin = (reconstruct.__name__,)
+    with FileMemory(tmp_path / "memory.json") as memory:
+        alone = reached(CodeRoots(begin, frozenset(reconstruct.STAGE.code_when)), SOURCE_ROOT, memory)
+        with_prior = reached(CodeRoots(begin), SOURCE_ROOT, memory)
+    assert not [name for name in alone if name.startswith("genassets.prior")]
+    assert "genassets.prior.network" in with_prior
 
 
 def test_file_memory_rereads_what_changed_and_survives_damage(tmp_path: Path) -> None:

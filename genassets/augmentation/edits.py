@@ -11,8 +11,8 @@ from genassets.driving.log import Track
 class PlacedAsset:
     """An asset of a library that stands in a log.
 
-    row: its row in the library's table. track: where it is at each frame, in the log's world; its actor_id is new to the
-    log, its size that at which the asset is drawn, in metres.
+    row: its row in the library's table. track: where it is at each frame, in the log's world; its actor_id is new to
+    the log, its size that at which the asset is drawn, in metres.
     """
 
     row: int

@@ -11,6 +11,10 @@ import sys
 import traceback
 from typing import Annotated
 
+# Before pydantic is first imported, here or in a process that a command starts: its search for plugins, of which there
+# are none, reads the metadata of every installed package.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
 import typer
 
 from genassets import __version__

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from genassets.errors import StageError
@@ -28,20 +29,24 @@ WITHOUT_EFFECT = frozenset(
 )
 
 
-def code_tree(roots: Sequence[str], source_root: Path, memory: FileMemory) -> dict[str, str]:
-    """Digest of every module of the package that ``roots`` reach by imports, by dotted name.
+@dataclass(frozen=True)
+class CodeRoots:
+    """Where a stage's code begins, and where it ends: dotted names of modules or packages.
 
-    Args:
-        roots: dotted names of modules or packages.
-        source_root: directory that holds the package's directory.
+    Imports are followed from ``begin``, but not into the modules named in ``end``.
     """
-    return code_trees([tuple(roots)], source_root, memory)[tuple(roots)]
+
+    begin: tuple[str, ...]
+    end: frozenset[str] = frozenset()
 
 
 def code_trees(
-    all_roots: Iterable[tuple[str, ...]], source_root: Path, memory: FileMemory
-) -> dict[tuple[str, ...], dict[str, str]]:
-    """As ``code_tree`` for several roots, by root; modules that they share are looked at once."""
+    all_roots: Iterable[CodeRoots], source_root: Path, memory: FileMemory
+) -> dict[CodeRoots, dict[str, str]]:
+    """For each of ``all_roots`` the digest of every module of the package that it reaches, by dotted name.
+
+    ``source_root`` is the directory that holds the package's directory. Modules that roots share are looked at once.
+    """
     looked: dict[str, tuple[str, list[str]] | None] = {}
 
     def look(name: str) -> tuple[str, list[str]] | None:
@@ -57,10 +62,10 @@ def code_trees(
     return {roots: _reached(roots, look) for roots in all_roots}
 
 
-def _reached(roots: Sequence[str], look: Callable[[str], tuple[str, list[str]] | None]) -> dict[str, str]:
+def _reached(roots: CodeRoots, look: Callable[[str], tuple[str, list[str]] | None]) -> dict[str, str]:
     digests: dict[str, str] = {}
-    waiting = list(roots)
-    seen: set[str] = set()
+    waiting = list(roots.begin)
+    seen = set(roots.end)
     while waiting:
         name = waiting.pop()
         if name in seen:
@@ -80,8 +85,9 @@ def module_file(name: str, source_root: Path) -> Path | None:
     """File of a module or package, or None where the name is an attribute or lies outside the package."""
     if name.partition(".")[0] != PACKAGE:
         return None
-    base = source_root.joinpath(*name.split("."))
-    for path in (base.with_suffix(".py"), base / "__init__.py"):
+    # Asked for each name that any module imports, so paths are built from one string.
+    base = f"{source_root}/{name.replace('.', '/')}"
+    for path in (Path(f"{base}.py"), Path(f"{base}/__init__.py")):
         if path.is_file():
             return path
     return None

@@ -85,7 +85,7 @@ def perform(
         found = store.find(name, digest)
         if found is not None and not step.forced:
             return Outcome(found, cached=True)
-        workflow.check_code(step.stage)
+        workflow.check_code(step)
         if step.forced and step.key not in workflow.selection.begun:
             store.clear_work(name, digest)
         with store.creating(name, digest) as out:
@@ -106,7 +106,7 @@ def perform(
             metrics = step.stage.run(Inputs(paths, workflow.borrowed(step)), config, out, context)
             seconds = time.monotonic() - started
             try:
-                workflow.check_code(step.stage)
+                workflow.check_code(step)
             except CodeChanged:
                 store.clear_work(name, digest)  # its checkpoints may be of the edited code
                 raise

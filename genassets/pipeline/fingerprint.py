@@ -43,7 +43,7 @@ def components(
 
     Args:
         inputs: content digest of each needed object, by stage and shard.
-        code: digest of each module, as by ``code_digest.code_tree``.
+        code: digest of each module, as by ``code_digest.code_trees``.
         sources: content digests of what the stage reads from outside the store, by config field.
     """
     return {

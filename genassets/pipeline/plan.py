@@ -10,7 +10,7 @@ from typing import Any
 from genassets.errors import CodeChanged, SpecError
 from genassets.pipeline.borrowed import find_output, output_digest
 from genassets.pipeline.catalog import dependents, wanted_stages
-from genassets.pipeline.code_digest import code_trees
+from genassets.pipeline.code_digest import CodeRoots, code_trees
 from genassets.pipeline.file_digests import FileMemory, sha256_of
 from genassets.pipeline.fingerprint import components, differences, fingerprint
 from genassets.pipeline.home import Home
@@ -23,7 +23,7 @@ from genassets.stages.stage import Borrowed, Stage
 CODE_MEMORY = "code.json"
 SOURCE_ROOT = Path(__file__).parents[2]
 
-_CODE_OF_PROCESS: dict[tuple[str, ...], dict[str, str]] = {}
+_CODE_OF_PROCESS: dict[CodeRoots, dict[str, str]] = {}
 """Code by roots as this process first saw it: what it has imported stays, whatever becomes of the files."""
 
 
@@ -141,38 +141,44 @@ class Workflow:
             step.shard,
             self.experiment.config(step.stage.name, step.shard),
             contents,
-            self.code_of(step.stage),
+            self.code_of(step),
             self.experiment.header.seed,
             self._sources_of(step),
         )
 
     def pin_code(self) -> None:
         """Digest the code of every stage now, before a long run gives anyone time to edit it."""
-        new = {_code_roots(stage) for stage in self.stages} - _CODE_OF_PROCESS.keys()
+        new = {self._code_roots(step) for step in self.steps()} - _CODE_OF_PROCESS.keys()
         if new:
             _CODE_OF_PROCESS.update(self._code_on_disk(new))
 
-    def code_of(self, stage: Stage) -> dict[str, str]:
-        """Digests of a stage's modules as they were when this process first asked for them."""
+    def code_of(self, step: Step) -> dict[str, str]:
+        """Digests of a step's modules as they were when this process first asked for them."""
         self.pin_code()
-        return _CODE_OF_PROCESS[_code_roots(stage)]
+        return _CODE_OF_PROCESS[self._code_roots(step)]
 
-    def check_code(self, stage: Stage) -> None:
-        """Raise CodeChanged when a stage's modules on disk are other than those that its fingerprint names.
+    def check_code(self, step: Step) -> None:
+        """Raise CodeChanged when a step's modules on disk are other than those that its fingerprint names.
 
         Stages import when they run, so an edit would mix old modules with new ones.
         """
-        roots = _code_roots(stage)
+        roots = self._code_roots(step)
         now = self._code_on_disk([roots])[roots]
-        changed = [name for name, _, _ in differences(self.code_of(stage), now)]
+        changed = [name for name, _, _ in differences(self.code_of(step), now)]
         if changed:
             shown = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
             raise CodeChanged(
                 f"the code changed while the run was going: {shown} (below {SOURCE_ROOT}) is not what stage "
-                f"{stage.name} was planned with, so nothing of it is stored; start it again: genassets resume"
+                f"{step.stage.name} was planned with, so nothing of it is stored; start it again: genassets resume"
             )
 
-    def _code_on_disk(self, roots: Iterable[tuple[str, ...]]) -> dict[tuple[str, ...], dict[str, str]]:
+    def _code_roots(self, step: Step) -> CodeRoots:
+        stage = step.stage
+        config = self.experiment.config(stage.name, step.shard)
+        left_out = (module for module, counts in stage.code_when.items() if not counts(config))
+        return CodeRoots((stage.run.__module__, *stage.modules), frozenset(left_out))
+
+    def _code_on_disk(self, roots: Iterable[CodeRoots]) -> dict[CodeRoots, dict[str, str]]:
         with FileMemory(self.home.cache / CODE_MEMORY) as memory:
             return code_trees(roots, SOURCE_ROOT, memory)
 
@@ -220,10 +226,6 @@ class Workflow:
             with FileMemory(self.home.cache / "sources" / f"log-{source.name}.json") as memory:
                 self._logs[source.name] = source_digest(source.root / source.name, memory)
         return self._logs[source.name]
-
-
-def _code_roots(stage: Stage) -> tuple[str, ...]:
-    return (stage.run.__module__, *stage.modules)
 
 
 def make_plan(workflow: Workflow) -> list[PlannedStep]:

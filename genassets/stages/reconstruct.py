@@ -5,10 +5,8 @@ With `adapt`, latents and backgrounds alone, for the decoder, fields and image n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pydantic import model_validator
 
@@ -16,12 +14,6 @@ from genassets.errors import StageError
 from genassets.reconstruction.settings import AdaptationSettings, ComputeSettings, ReconstructionSettings
 from genassets.specs.split import Split
 from genassets.stages.stage import MODEL_CODE, Borrowed, Inputs, Metric, Stage, StageContext
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from genassets.reconstruction.latent_prior import LatentPull
-    from genassets.reconstruction.model import AssetModel
 
 
 class ReconstructConfig(ReconstructionSettings, ComputeSettings):
@@ -77,11 +69,14 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
         compute=compute,
     )
     pull_of = None
-    if config.adapt is not None and config.adapt.prior is not None:
+    adapt = config.adapt
+    if adapt is not None and adapt.prior is not None:
+        from genassets.stages.prior_pull import prior_pull
+
         if chosen_device(compute) != "cpu":
             raise StageError("reconstruct.adapt.prior pulls on the CPU alone; set reconstruct.device=cpu")
         times = {log.name: log.time_of_day for log in logs}
-        pull_of = partial(prior_pull, config.adapt, inputs.borrowed["train_prior"], times)
+        pull_of = partial(prior_pull, adapt, inputs.borrowed["train_prior"], times)
     if compute.processes > 1:
         counts = run_together(job, context.progress, context.curve)
     else:
@@ -92,36 +87,13 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
     ]
 
 
-def prior_pull(
-    settings: AdaptationSettings,
-    path: Path,
-    times: Mapping[str, str],
-    model: AssetModel,
-    assets: pd.DataFrame,
-) -> LatentPull:
-    """The prior's pull at the codes of a model that is adapted; times: "day" or "night" of each log.
-
-    Raises:
-        StageError: the prior was learned from codes of another decoder.
-    """
-    from genassets.prior.conditions import Conditions
-    from genassets.prior.library_codes import decoder_digest
-    from genassets.prior.prior_file import load_prior
-    from genassets.prior.pull import DiffusionPull
-    from genassets.reconstruction.latent_prior import LatentPull
-
-    trained = load_prior(path)
-    trained.check_decoder(decoder_digest(model), f"reconstruct.adapt.prior, {path}")
-    conditions = Conditions.of(
-        [str(name) for name in assets["actor_class"]], [times[str(log)] for log in assets["log"]]
-    )
-    pull = DiffusionPull(trained.model, model.sizes, conditions)
-    return LatentPull(pull, settings.prior_weight, settings.prior_reuse)
-
-
 def needed_files(config: ReconstructConfig) -> dict[str, str]:
     """The pinned files that training cannot do without."""
     return {"lpips-vgg16": "reconstruct.weights.perceptual=0"} if config.weights.perceptual else {}
+
+
+def _prior_pulls(config: ReconstructConfig) -> bool:
+    return config.adapt is not None and config.adapt.prior is not None
 
 
 def borrowed_library(config: ReconstructConfig) -> tuple[Borrowed, ...]:
@@ -139,17 +111,8 @@ STAGE = Stage(
     version=1,
     config=ReconstructConfig,
     needs=("ingest",),
-    modules=(
-        "genassets.prior.conditions",
-        "genassets.prior.library_codes",
-        "genassets.prior.model",
-        "genassets.prior.network",
-        "genassets.prior.prior_file",
-        "genassets.prior.pull",
-        "genassets.prior.schedule",
-        "genassets.prior.settings",
-        *MODEL_CODE,
-    ),
+    modules=MODEL_CODE,
+    code_when={"genassets.stages.prior_pull": _prior_pulls},
     run=run,
     sharded=False,
     summary="Learn latents, decoder, fields and backgrounds",

@@ -153,6 +153,8 @@ class Stage:
         needs: stages whose outputs are read. A sharded stage that needs a sharded stage reads its own shard.
         modules: packages and modules of genassets whose code decides the result, by dotted name
             ("genassets.masks"); the stage's own module is always included.
+        code_when: modules that decide the result with some configs alone, each with the test of a config. With the
+            others neither they nor what only they import count as the stage's code.
         runtime_only: config fields that change how fast the result comes, never the result.
         location_files: outputs that say where data lie, not what they are; when only these change, the
             stages that read this one don't run again.
@@ -174,6 +176,7 @@ class Stage:
     run: Callable[[Inputs, Any, Path, StageContext], list[Metric]]
     sharded: bool
     summary: str
+    code_when: Mapping[str, Callable[[Any], bool]] = field(default_factory=dict)
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()
     reads: Callable[[Any], Mapping[str, str]] = field(default=_nothing)
