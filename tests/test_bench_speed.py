@@ -140,6 +140,12 @@ def test_the_dense_reference_is_the_exact_mode_at_its_steps(prepared: Prepared) 
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_the_timed_parts_of_rendering_exist() -> None:
+    for functions in rendering.PARTS.values():
+        for owner, name in functions:
+            assert callable(getattr(rendering.holder_of(owner), name)), f"{owner}.{name}"
+
+
 @pytest.mark.slow
 def test_the_benchmark_of_rendering_at_a_tiny_size(log: Log) -> None:
     rows = rendering.measure(log.root, changed(SETTINGS, steps=2), 1, 1, lambda _: None)

@@ -36,10 +36,12 @@ PARTS = {
     "cast rays": (("genassets.reconstruction.scene_renderer", "region_rays"),),
     "actor samples, coarse cull": (("genassets.reconstruction.scene_renderer", "cull"),),
     "background samples, occupancy": (("genassets.rendering.renderer", "sample_background"),),
-    "triplane look-up": (("genassets.rendering.renderer", "interpolate_triplanes"),),
+    "triplane look-up": (("genassets.rendering.evaluation", "interpolate_triplanes"),),
     "distance network": (("genassets.fields.feature_field.FeatureField", "distance"),),
     "feature network": (("genassets.fields.feature_field.FeatureField", "feature"),),
     "order and composite": (
+        ("genassets.rendering.front_to_back", "depth_order"),
+        ("genassets.rendering.front_to_back", "render_weights"),
         ("genassets.rendering.renderer", "depth_order"),
         ("genassets.rendering.renderer", "render_weights"),
         ("genassets.rendering.renderer", "accumulate"),
@@ -227,16 +229,21 @@ DENSE_ROWS = 4
 """Rows of feature pixels that the dense reference holds at once."""
 
 
+def holder_of(owner: str) -> Any:
+    """The module or class of this dotted name."""
+    from importlib import import_module
+
+    module, _, cls = owner.rpartition(".")
+    return getattr(import_module(module), cls) if cls[0].isupper() else import_module(owner)
+
+
 @contextmanager
 def _timed(owner: str, name: str, taken: list[float], running: list[str]) -> Iterator[None]:
     """Add to `taken` the seconds of every call of a function while the context lasts.
 
     Calls from within another timed function, which `running` names, are part of that one.
     """
-    from importlib import import_module
-
-    module, _, cls = owner.rpartition(".")
-    holder: Any = getattr(import_module(module), cls) if cls[0].isupper() else import_module(owner)
+    holder = holder_of(owner)
     original = getattr(holder, name)
 
     def call(*arguments: Any, **named: Any) -> Any:
