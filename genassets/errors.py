@@ -36,6 +36,12 @@ class LogError(GenAssetsError):
     exit_code = 3
 
 
+class DatasetError(GenAssetsError):
+    """A detector set cannot be written, or one on disk is missing, incomplete or malformed."""
+
+    exit_code = 3
+
+
 class LockedError(GenAssetsError):
     """Another process holds the lock of the object this one wants to write."""
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 from PIL import Image, ImageSequence
 from test_turntables import SIZE, BoxRenderer, box_distance
 
+from genassets.driving.licences import LICENCES
 from genassets.errors import StageError
 from genassets.export.actor_export import ExportSettings, export_actor
 from genassets.export.bake import agreement, bake
 from genassets.export.body import Body, actor_body, signed_volume, visible_distance, without_fragments
-from genassets.export.card import LICENCES, Card, MeshFacts, Nearest, Observed, Subject, markdown
+from genassets.export.card import Card, MeshFacts, Nearest, Observed, Subject, markdown
 from genassets.export.choice import folder_names, spread_over_classes
 from genassets.export.mesh import SurfaceMesh
 from genassets.export.mesh_files import linear_from_srgb, on_ground, write_glb, write_ply

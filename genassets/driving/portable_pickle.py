@@ -1,4 +1,4 @@
-"""Pickled pandas tables that old and new pandas open, with the same bytes every time."""
+"""Pickles that old and new numpy and pandas open, with the same bytes every time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import pickle
 import pickletools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,13 @@ def make_table(
 
 
 def pickle_table(table: pandas.DataFrame) -> bytes:
-    """The gzipped pickle of a table, naming numpy's functions where numpy 1 and 2 both find them."""
-    return gzip.compress(_name_old_numpy(pickle.dumps(table, protocol=PROTOCOL)), COMPRESSION, mtime=0)
+    """The gzipped pickle of a table; see pickle_portably."""
+    return gzip.compress(pickle_portably(table), COMPRESSION, mtime=0)
+
+
+def pickle_portably(value: Any) -> bytes:
+    """The pickle of a value, naming numpy's functions where numpy 1 and 2 both find them."""
+    return _name_old_numpy(pickle.dumps(value, protocol=PROTOCOL))
 
 
 def _name_old_numpy(stream: bytes) -> bytes:

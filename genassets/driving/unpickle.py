@@ -1,7 +1,7 @@
-"""Pickled pandas tables of unknown origin, read without running what they name.
+"""Pickled numpy arrays and pandas tables of unknown origin, read without running what they name.
 
-A pickle can name any importable function and call it. Only what a DataFrame of numbers, text and an index
-needs is allowed here, under the names that pandas 0.25 to 3 and numpy 1 and 2 gave it; anything else is
+A pickle can name any importable function and call it. Only what arrays, or a DataFrame of numbers, text and an index
+need is allowed here, under the names that pandas 0.25 to 3 and numpy 1 and 2 gave it; anything else is
 refused before it is imported.
 """
 
@@ -20,17 +20,21 @@ if TYPE_CHECKING:
     import pandas
 
 _INDEXES = "pandas.core.indexes.base"
-_ALLOWED: frozenset[tuple[str, str]] = frozenset(
+_ARRAYS: frozenset[tuple[str, str]] = frozenset(
     [
-        ("builtins", "slice"),
-        ("builtins", "bytearray"),
         ("_codecs", "encode"),  # bytes in protocol 2: a text and a codec
-        ("functools", "partial"),  # pandas 1.3 wraps new_block in it; what it wraps is looked up here too
         ("numpy", "ndarray"),
         ("numpy", "dtype"),
         ("numpy._core.multiarray", "_reconstruct"),
         ("numpy._core.multiarray", "scalar"),
         ("numpy._core.numeric", "_frombuffer"),
+    ]
+)
+_TABLES = _ARRAYS | frozenset(
+    [
+        ("builtins", "slice"),
+        ("builtins", "bytearray"),
+        ("functools", "partial"),  # pandas 1.3 wraps new_block in it; what it wraps is looked up here too
         ("pandas", "DataFrame"),
         ("pandas", "Index"),
         ("pandas", "RangeIndex"),
@@ -60,8 +64,10 @@ class ForbiddenGlobal(pickle.UnpicklingError):
     """The pickle names something outside the allow-list."""
 
 
-class TableUnpickler(pickle.Unpickler):
-    """An unpickler that finds nothing but the parts of a DataFrame."""
+class ArrayUnpickler(pickle.Unpickler):
+    """An unpickler that finds nothing but numpy arrays, beside Python's own containers, numbers and texts."""
+
+    allowed = _ARRAYS
 
     def find_class(self, module: str, name: str) -> Any:
         """The allowed global; raises ForbiddenGlobal before anything else is imported."""
@@ -70,9 +76,15 @@ class TableUnpickler(pickle.Unpickler):
         if module.startswith("numpy.core."):
             module = module.replace("numpy.core.", "numpy._core.", 1)
         module, name = _MOVED.get((module, name), (module, name))
-        if (module, name) not in _ALLOWED:
+        if (module, name) not in self.allowed:
             raise ForbiddenGlobal(f"{module}.{name}")
         return super().find_class(module, name)
+
+
+class TableUnpickler(ArrayUnpickler):
+    """An unpickler that finds nothing but the parts of a DataFrame."""
+
+    allowed = _TABLES
 
 
 def read_table(path: Path) -> pandas.DataFrame:

@@ -8,40 +8,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from genassets.driving.licences import Licence
+
 CARD_VERSION = 1
 JSON_FILE = "card.json"
 MARKDOWN_FILE = "card.md"
-
-
-@dataclass(frozen=True)
-class Licence:
-    """The licence of the data that an actor was learned from."""
-
-    name: str
-    terms: str
-    url: str
-    attribution: str
-
-
-LICENCES: Mapping[str, Licence] = {
-    "pandaset": Licence(
-        "CC BY 4.0 with the PandaSet Dataset Terms of Use",
-        "Data derived from PandaSet stay under its terms: give credit, say what was changed, do not identify persons, "
-        "use no name or mark of the licensors beyond the credit. The terms prevail over CC BY 4.0 where they differ.",
-        "https://creativecommons.org/licenses/by/4.0/",
-        "PandaSet by Hesai and Scale AI (pandaset.org); reconstructed by genassets from camera images and LiDAR",
-    ),
-    "synthetic_city": Licence(
-        "Apache-2.0",
-        "Made by genassets' own city generator, from no recorded data: the licence of genassets.",
-        "https://www.apache.org/licenses/LICENSE-2.0",
-        "genassets",
-    ),
-}
-"""By kind of log, as ingest's log.json has it."""
-UNKNOWN_LICENCE = Licence(
-    "unknown", "The source data's terms hold; this export does not know them.", "", "unknown"
-)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -273,11 +273,13 @@ def _licence(kinds: set[str]) -> Any:
     """The terms of actors of a library learned from logs of these kinds: they share decoder and image network, so
     recorded data's terms hold for all.
     """
-    from genassets.export.card import LICENCES, UNKNOWN_LICENCE
+    from genassets.driving.licences import LICENCES, licence_of
 
-    if not kinds <= set(LICENCES):
-        return UNKNOWN_LICENCE
-    return LICENCES["pandaset" if "pandaset" in kinds else "synthetic_city"]
+    licence = licence_of(kinds)
+    if licence != LICENCES["pandaset"]:
+        return licence
+    changed = f"{licence.attribution}; reconstructed by genassets from camera images and LiDAR"
+    return replace(licence, attribution=changed)
 
 
 def _digest(library: Path) -> str:
