@@ -18,7 +18,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 import typer
 
 from genassets import __version__
-from genassets.cli import weights
+from genassets.cli import dataset, weights
 from genassets.cli.bench import bench
 from genassets.cli.complete import complete
 from genassets.cli.doctor import doctor
@@ -91,6 +91,7 @@ app.command("generate")(generate)
 app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)
+app.add_typer(dataset.app, name="dataset")
 app.add_typer(weights.app, name="weights")
 
 

@@ -11,7 +11,7 @@ from genassets.driving.classes import CLASSES
 from genassets.driving.log import CameraStream, Log, Track
 from genassets.driving.sweep import Sweep
 from genassets.geometry.boxes import EDGES, FRONT_CORNERS, box_corners
-from genassets.geometry.cameras import project
+from genassets.geometry.cameras import Intrinsics, project
 from genassets.geometry.transforms import invert_pose, transform_points
 
 Image = NDArray[np.uint8]
@@ -60,9 +60,19 @@ def draw_overlay(log: Log, camera: CameraStream, frame: int, sweep: Sweep | None
 
 
 def draw_box(image: Image, camera: CameraStream, camera_from_box: NDArray[np.float64], track: Track) -> None:
-    """Draw one box into the image, its edges cut at the near plane."""
-    corners = box_corners(camera_from_box, track.size)
-    colour = CLASS_COLOURS[track.actor_class]
+    """Draw an actor's box into the image in the colour of its class."""
+    draw_edges(image, camera.intrinsics, camera_from_box, track.size, CLASS_COLOURS[track.actor_class])
+
+
+def draw_edges(
+    image: Image,
+    intrinsics: Intrinsics,
+    camera_from_box: NDArray[np.float64],
+    size: NDArray[np.float64],
+    colour: tuple[int, int, int],
+) -> None:
+    """Draw a box's edges into the image, cut at the near plane; its front is crossed, a line on its floor points there."""
+    corners = box_corners(camera_from_box, size)
     width = max(1, round(image.shape[1] / 960))
     front_left, front_right, top_right, top_left = corners[list(FRONT_CORNERS)]
     floor = corners[:4].mean(axis=0)
@@ -70,7 +80,7 @@ def draw_box(image: Image, camera: CameraStream, camera_from_box: NDArray[np.flo
     segments += [(front_left, top_right, width), (front_right, top_left, width)]
     segments += [(floor, (front_left + front_right) / 2, 2 * width)]
     for start, end, thickness in segments:
-        _draw_segment(image, camera, start, end, colour, thickness)
+        _draw_segment(image, intrinsics, start, end, colour, thickness)
 
 
 def draw_points(image: Image, camera: CameraStream, frame: int, points: NDArray[np.float64]) -> None:
@@ -138,7 +148,7 @@ def draw_frame(log: Log, frame: int, cameras: Sequence[str] | None = None) -> di
 
 def _draw_segment(
     image: Image,
-    camera: CameraStream,
+    intrinsics: Intrinsics,
     start: NDArray[np.float64],
     end: NDArray[np.float64],
     colour: tuple[int, int, int],
@@ -151,7 +161,7 @@ def _draw_segment(
     if start[2] < NEAR or end[2] < NEAR:
         cut = start + (NEAR - start[2]) / (end[2] - start[2]) * (end - start)
         start, end = (cut, end) if start[2] < NEAR else (start, cut)
-    a, b = project(camera.intrinsics, np.stack([start, end])) - 0.5  # OpenCV counts from pixel centres
+    a, b = project(intrinsics, np.stack([start, end])) - 0.5  # OpenCV counts from pixel centres
     clipped = _clip_to(image.shape[1], image.shape[0], a, b)
     if clipped is not None:
         (ax, ay), (bx, by) = clipped
