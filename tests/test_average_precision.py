@@ -27,7 +27,7 @@ def found(rows: list[tuple[int, float, float, float]]) -> Predictions:
 
 
 def scene(seed: int) -> tuple[GroundTruth, Predictions]:
-    """Crowded random boxes on a grid of 1/4 m, so that distances meet thresholds and each other; scores in steps of 1/8."""
+    """Crowded random boxes on a grid of 1/4 m, so that distances meet thresholds and each other; nine scores."""
     random = np.random.default_rng(seed)
     samples, boxes = int(random.integers(1, 6)), int(random.integers(1, 40))
     centres = random.integers(0, 80, (boxes, 2)) / 4
@@ -53,9 +53,15 @@ def devkit_precision(ground_truth: GroundTruth, predictions: Predictions, thresh
         listed = EvalBoxes()
         for sample, centre, score in zip(samples.tolist(), centres.tolist(), scores, strict=True):
             box = DetectionBox(
-                sample_token=str(sample), translation=(*centre, 0.0), size=(2.0, 4.0, 1.5), rotation=(1.0, 0.0, 0.0, 0.0),
-                velocity=(0.0, 0.0), detection_name="car", detection_score=float(score), attribute_name="vehicle.moving",
-            )  # fmt: skip
+                sample_token=str(sample),
+                translation=(*centre, 0.0),
+                size=(2.0, 4.0, 1.5),
+                rotation=(1.0, 0.0, 0.0, 0.0),
+                velocity=(0.0, 0.0),
+                detection_name="car",
+                detection_score=float(score),
+                attribute_name="vehicle.moving",
+            )
             listed.add_boxes(str(sample), [box])
         return listed
 

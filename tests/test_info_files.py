@@ -180,7 +180,7 @@ def test_a_parked_car_to_the_right_has_the_closed_forms_numbers(log: Log) -> Non
 
 
 def test_sensor_to_lidar_has_the_cars_motion_between_both_stamps_in_it(log: Log) -> None:
-    """At 5 m/s the camera, 50 ms earlier, stands 0.25 m behind the LiDAR's place at its own stamp; before the log too."""
+    """At 5 m/s the camera, 50 ms earlier, stands 0.25 m behind where the LiDAR is; so before the log's first frame."""
     for entry in v0_document(frames_of(log))["infos"]:
         camera = entry["cams"]["front_camera"]
         np.testing.assert_allclose(sensor_to_lidar(camera)[:3, 3], [-0.25, 0.0, -0.2], atol=1e-6)
@@ -232,7 +232,7 @@ def test_twins_are_one_box_with_the_points_of_its_own_lidar(log: Log) -> None:
 
 
 def test_velocity_is_the_cars_over_the_ground_along_the_detectors_axes(log: Log) -> None:
-    """8 m/s along the ego car's forward axis; turned by 90 degrees it points to the left of a car that looks along -y."""
+    """8 m/s along the ego car's forward axis, which is to the left of a car that looks along -y."""
     for frame in frames_of(log):
         moving = [uuids[0] for uuids in frame.uuids].index(MOVING)
         np.testing.assert_allclose(frame.velocities[moving], [MOVING_SPEED, 0.0], atol=1e-3)

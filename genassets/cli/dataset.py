@@ -42,7 +42,7 @@ def write(
     empty_frames: Annotated[str, typer.Option(help="Frames without a box: keep or drop.")] = "keep",
     as_json: AsJson = False,
 ) -> None:
-    """Write frames and boxes of logs as one folder that BEVFormer and mmdetection3d read; it appears whole or not at all."""
+    """Write frames and boxes of logs as one folder for BEVFormer and mmdetection3d; it appears whole or not at all."""
     import json
 
     from genassets.detection.detection_set import write_detection_set
@@ -75,7 +75,7 @@ def check(
     samples: Annotated[int, typer.Option(min=1, max=32, help="Frames on the sheet.")] = 4,
     as_json: AsJson = False,
 ) -> None:
-    """Check every file, box, count and projection of a detector set, and draw a sample sheet; ends with 3 on a problem."""
+    """Check every file, box, count and projection of a set, and draw a sample sheet; ends with 3 on a problem."""
     import json
 
     from genassets.detection.set_check import check_detection_set

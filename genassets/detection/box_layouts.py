@@ -1,8 +1,8 @@
 """The two ways in which detectors write a box as seven numbers, and the pose that both mean.
 
-v1 (mmdetection3d from 1.0): x, y, z, l, w, h, psi. v0 (BEVFormer, mmdetection3d before 1.0): x, y, z, w, l, h, -psi - pi/2.
-psi is counter-clockwise from the frame's x axis to the box's length. z is the centre in both files: the loaders shift it to the
-bottom face themselves.
+v1 (mmdetection3d from 1.0): x, y, z, l, w, h, psi. v0 (BEVFormer, mmdetection3d before 1.0): x, y, z, w, l, h, -psi
+- pi/2. psi is counter-clockwise from the frame's x axis to the box's length. z is the centre in both files: the
+loaders shift it to the bottom face themselves.
 """
 
 from __future__ import annotations

@@ -79,10 +79,10 @@ def write_detection_set(
 ) -> SetCard:
     """Write logs' frames as a detector set, and return its card.
 
-    train, val: PandaSet directories; those with a provenance.parquet are augmented. A frame without image or sweep is left
-    out and listed on the card. One frame is in memory at a time.
-    Raises DatasetError where the folder exists, two logs have one name, an augmented log's source is in the other split, or
-    a split has no frame; LogError where a log is malformed.
+    train, val: PandaSet directories; those with a provenance.parquet are augmented. A frame without image or sweep
+    is left out and listed on the card. One frame is in memory at a time.
+    Raises DatasetError where the folder exists, two logs have one name, an augmented log's source is in the other
+    split, or a split has no frame; LogError where a log is malformed.
     """
     settings = settings or LabelSettings()
     if folder.exists():
@@ -102,8 +102,8 @@ def write_detection_set(
 def plan_scenes(train: Sequence[Path], val: Sequence[Path]) -> list[Scene]:
     """The logs in the order of their stamps, each with a name and a shift that keep tokens and stamps apart.
 
-    A log as recorded keeps its name; augmented ones are their source's with -aug1, -aug2, .. in the given order. A log whose
-    stamps meet those of one before it is shifted behind it, so that scenes follow each other whole.
+    A log as recorded keeps its name; augmented ones are their source's with -aug1, -aug2, .. in the given order. A
+    log whose stamps meet those of one before it is shifted behind it, so that scenes follow each other whole.
     """
     logs = [
         _look(Path(root), split) for split, roots in zip(SPLITS, (train, val), strict=True) for root in roots
@@ -124,8 +124,8 @@ def plan_scenes(train: Sequence[Path], val: Sequence[Path]) -> list[Scene]:
         for other in logs:
             if log.source_log == other.source_log and log.split != other.split:
                 raise DatasetError(
-                    f"{log.root}: made from log {log.source_log}, as is {other.root} of the other split: what is tested would "
-                    "have been trained on. Put both into one split."
+                    f"{log.root}: made from log {log.source_log}, as is {other.root} of the other split: what is "
+                    "tested would have been trained on. Put both into one split."
                 )
     scenes, end = [], -1
     for place in sorted(range(len(logs)), key=lambda place: (logs[place].first, place)):
@@ -169,9 +169,10 @@ def _write(
         facts.append(facts_of_scene)
     for split in SPLITS:
         if any(scene.split == split for scene in scenes) and not frames[split]:
+            of_split = ", ".join(scene.name for scene in scenes if scene.split == split)
             raise DatasetError(
-                f"{split}: no frame is left of {', '.join(s.name for s in scenes if s.split == split)}: each lacks its image or "
-                "sweep, or has no label and empty frames are dropped. Add logs, or keep empty frames."
+                f"{split}: no frame is left of {of_split}: each lacks its image or sweep, or has no label "
+                "and empty frames are dropped. Add logs, or keep empty frames."
             )
         if frames[split]:
             write_infos(work, split, frames[split], settings.categories)

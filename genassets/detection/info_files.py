@@ -1,13 +1,16 @@
 """The two files that camera detectors are trained from: BEVFormer's pickle (v0) and mmdetection3d's (v2).
 
-Both say the same of each frame; they differ in how boxes, poses and paths are written (docs/detection.md). They hold Python's
-containers, numbers and texts, and numpy arrays under names that numpy 1 and 2 know: nothing of genassets is needed to open them.
+Both say the same of each frame; they differ in how boxes, poses and paths are written (docs/detection.md). They
+hold Python's
+containers, numbers and texts, and numpy arrays under names that numpy 1 and 2 know: nothing of genassets is needed
+to open them.
 """
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -57,7 +60,7 @@ def write_infos(
 
     Raises ValueError where stamps do not increase: BEVFormer sorts by them, and would mix scenes.
     """
-    for one, other in zip(frames, frames[1:], strict=False):
+    for one, other in pairwise(frames):
         if other.timestamp <= one.timestamp:
             raise ValueError(
                 f"{other.token}: stamp {other.timestamp} is not after {one.token}'s {one.timestamp}"
@@ -101,7 +104,8 @@ def v2_document(frames: Sequence[LabelledFrame], categories: Mapping[str, int]) 
 def read_infos(path: Path) -> dict[str, Any]:
     """The document in a v0 or v2 file, of genassets or any other writer; runs nothing that the pickle names.
 
-    Raises DatasetError where the file is missing or corrupt, names anything but numpy arrays, or holds no list of frames.
+    Raises DatasetError where the file is missing or corrupt, names anything but numpy arrays, or holds no list of
+    frames.
     """
     advice = "Write the set again, or take the file from a source that you trust."
     try:
@@ -110,8 +114,8 @@ def read_infos(path: Path) -> dict[str, Any]:
         raise DatasetError(f"{path}: no such file; expected an info file of a detector set.") from error
     except ForbiddenGlobal as error:
         raise DatasetError(
-            f"{path}: the pickle names '{error}', which frames and boxes have no use for, so it was not loaded: it may run "
-            f"foreign code. {advice}"
+            f"{path}: the pickle names '{error}', which frames and boxes have no use for, so it was not loaded: it may "
+            f"run foreign code. {advice}"
         ) from error
     except Exception as error:  # a corrupt pickle can raise anything at all
         raise DatasetError(

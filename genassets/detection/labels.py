@@ -1,7 +1,8 @@
 """What a detector is to find in one frame of a log: boxes in the car's frame, with all that the info files say of it.
 
-The detector's LiDAR frame is the car's at the frame's stamp, levelled: x forward, y left, z straight up. The files know boxes by
-one angle, and logs annotate them upright in the world. In the frame of lidar/poses.json, which in sequence 002 is tilted by
+The detector's LiDAR frame is the car's at the frame's stamp, levelled: x forward, y left, z straight up. The files
+know boxes by one angle, and logs annotate them upright in the world. In the frame of lidar/poses.json, which in
+sequence 002 is tilted by
 2 degrees, they would lean: half a car's length by 8 cm, and the ground at 80 m by 2.8 m.
 """
 
@@ -70,7 +71,8 @@ class LabelSettings:
 class LabelledFrame:
     """One frame with its labels; N boxes.
 
-    index: 0, 1, .. over the frames of its scene that are used; frame: its number in the log. token: `scene` and that number.
+    index: 0, 1, .. over the frames of its scene that are used; frame: its number in the log. token: `scene` and
+    that number.
     timestamp, camera_timestamp: microseconds since 1970, shifted by what keeps a set's stamps apart.
     world_from_ego, world_from_ego_at_camera: (4, 4), the levelled car at the frame's stamp and at the camera's own.
     ego_from_camera: (4, 4), both at the camera's stamp.
@@ -187,7 +189,8 @@ def count_points(points: Points, box: Array, lidar: int) -> int:
 
 
 def velocity_at(track: Track, row: int) -> Array:
-    """World velocity (3,) in m/s at a pose of a track: between the poses before and after it, where they are near in time.
+    """World velocity (3,) in m/s at a pose of a track: between the poses before and after it, where they are near
+    in time.
 
     At the ends of a track between that pose and its neighbour; 0 for stationary actors and where there is no neighbour.
     """

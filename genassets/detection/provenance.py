@@ -56,7 +56,8 @@ class LogProvenance:
     """Which boxes of a log were changed, as augmentation leaves it beside the log; of a plain log nothing was.
 
     path: the file, None for a plain log. source_log: the log that was changed, the log itself where nothing was.
-    rows: what is known of a box, by frame and annotation id. complete: whether boxes that were left alone have rows too.
+    rows: what is known of a box, by frame and annotation id. complete: whether boxes that were left alone have rows
+    too.
     """
 
     path: Path | None
@@ -72,8 +73,8 @@ class LogProvenance:
         rows = [self.rows[frame.frame, uuid] for uuid in frame.uuids[box] if (frame.frame, uuid) in self.rows]
         if not rows and self.complete:
             raise DatasetError(
-                f"{self.path}: has no row for frame {frame.frame}, box {frame.uuids[box][0]}; expected one for every box, as "
-                "it lists real ones. Augment the log again."
+                f"{self.path}: has no row for frame {frame.frame}, box {frame.uuids[box][0]}; expected one for "
+                "every box, as it lists real ones. Augment the log again."
             )
         row = rows[0] if rows else {}
         return {"origin": row.get("origin", REAL), **{name: row.get(name) for name in _OF_ASSET}}

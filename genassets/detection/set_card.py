@@ -1,4 +1,4 @@
-"""The data card of a detector set: what is in it, by which conventions, where it comes from, what one may do with it."""
+"""The data card of a detector set: what is in it, by which conventions, from where, and what one may do with it."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ MARKDOWN_FILE = "card.md"
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """One log of a set. `empty_frames` counts frames without a label, kept or not; `boxes` those of the frames that are kept.
+    """One log of a set. `empty_frames` counts frames without a label, kept or not; `boxes` those of the frames that
+    are kept.
 
-    kind: of the source data, as in driving/licences.py. origins: boxes by origin. asset_logs: where placed assets come from.
+    kind: of the source data, as in driving/licences.py. origins: boxes by origin. asset_logs: where placed assets
+    come from.
     left_out: a line for each frame that could not be used.
     """
 
@@ -135,12 +137,13 @@ def markdown(card: SetCard) -> str:
             )
     lines += [
         "",
-        f"Camera: {card.settings.camera}. Classes: {classes}. Boxes whose centre lies within x {x0:g} to {x1:g}, y {y0:g} to "
-        f"{y1:g}, z {z0:g} to {z1:g} m of the car's frame and that the image shows some part of. Frames without a box: "
-        f"{'kept' if card.settings.empty_frames == 'keep' else 'dropped'}.",
+        f"Camera: {card.settings.camera}. Classes: {classes}. Boxes whose centre lies within x {x0:g} to {x1:g}, "
+        f"y {y0:g} to {y1:g}, z {z0:g} to {z1:g} m of the car's frame and that the image shows some part of. "
+        f"Frames without a box: {'kept' if card.settings.empty_frames == 'keep' else 'dropped'}.",
         "",
-        "Frame of boxes and points: the car's at the frame's stamp, x forward, y left, z up, metres. One size an actor; of boxes "
-        "annotated twice, by both LiDARs, one. `num_lidar_pts` counts points of the LiDAR that the box was fitted to.",
+        "Frame of boxes and points: the car's at the frame's stamp, x forward, y left, z up, metres. One size an actor; "
+        "of boxes annotated twice, by both LiDARs, one. `num_lidar_pts` counts points of the LiDAR that the box was "
+        "fitted to.",
         "",
         "| file | for |",
         "|---|---|",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -36,12 +36,15 @@ from genassets.geometry.cameras import clip_edges, convex_hull
 from genassets.geometry.transforms import make_pose, rotation_from_quaternion
 
 Array = NDArray[np.float64]
+Rows = Mapping[tuple[str, int], Any]
+"""Rows of the provenance table by token and box."""
 
 NEAR = 0.1
 """Metres; boxes are cut here before they are projected, as when they were labelled."""
 SAME = 1e-6
-"""Metres, radians and seconds within which two files say the same: far above what float64 loses, far below what matters."""
+"""Metres, radians and seconds within which two files say the same: above what float64 loses, below what matters."""
 AGAIN = "Write the set again"
+POINT_BYTES = 4 * len(POINT_FEATURES)
 
 _ARRAYS = {
     "gt_boxes": (np.floating, 7),
@@ -67,66 +70,85 @@ def check_detection_set(folder: Path) -> SetReport:
     """Check a set; raises DatasetError only where the folder is no set at all (no card, no info file)."""
     card = read_card(folder)
     splits = [
-        split for split in SPLITS if (folder / v0_file(split)).exists() or (folder / v2_file(split)).exists()
+        split for split in SPLITS if any((folder / file(split)).exists() for file in (v0_file, v2_file))
     ]
     if not splits:
         raise DatasetError(f"{folder}: has no {v0_file('train')}; expected a detector set. {AGAIN}.")
     problems: list[str] = []
     listed = _check_files(folder, problems)
-    rows = _read(problems, lambda: read_provenance(folder / PROVENANCE_FILE))
-    frames = boxes = 0
-    scenes: dict[str, list[int]] = {}
+    table = _read(problems, lambda: read_provenance(folder / PROVENANCE_FILE))
+    rows = None if table is None else {(row.token, row.box): row for row in table.itertuples()}
+    whole: list[Mapping[str, Any]] = []
     stamps: dict[int, str] = {}
-    seen: set[tuple[str, int]] = set()
+    count = 0
     for split in splits:
-        v0 = _read(problems, lambda split=split: read_infos(folder / v0_file(split))["infos"])
-        v2 = _read(problems, lambda split=split: read_infos(folder / v2_file(split))["data_list"])
-        if v0 is None or v2 is None:
-            continue
-        if len(v0) != len(v2):
-            problems.append(
-                f"{folder / v2_file(split)}: {len(v2)} frames, {v0_file(split)} has {len(v0)}. {AGAIN}."
-            )
-        of_split = rows[rows["split"] == split] if rows is not None else None
-        by_box = (
-            {(row.token, row.box): row for row in of_split.itertuples(index=False)}
-            if of_split is not None
-            else None
-        )
-        problems += _check_order(folder / v0_file(split), v0, stamps)
-        for number, entry in enumerate(v0):
-            other = v2[number] if number < len(v2) else None
+        entries, others = _read_split(folder, split, problems)
+        problems += _check_order(folder / v0_file(split), entries, stamps)
+        count += len(entries)
+        for number, (entry, other) in enumerate(zip(entries, others, strict=True)):
+            where = Place(folder, split, number)
             try:
-                found = list(_check_frame(folder, split, number, entry, other, card, listed, by_box))
-                count = len(entry["gt_boxes"])
-                seen |= {(str(entry["token"]), box) for box in range(count)}
-                tally = scenes.setdefault(str(entry["scene_token"]), [0, 0])
-                tally[0] += 1
-                tally[1] += count
-                boxes += count
-            except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-                found = [
-                    f"{folder / v0_file(split)}: frame {number}: malformed ({type(error).__name__}: {error}). {AGAIN}."
-                ]
-            problems += found
-            frames += 1
+                problems += _check_frame(where, entry, other, card, listed, rows)
+                whole.append(entry)
+            except (KeyError, TypeError, ValueError, IndexError, AttributeError, StopIteration) as error:
+                problems.append(f"{where.v0}: malformed ({type(error).__name__}: {error}). {AGAIN}.")
     if rows is not None:
-        for row in rows.itertuples():
-            if (row.token, row.box) not in seen:
-                problems.append(
-                    f"{folder / PROVENANCE_FILE}: row {row.Index}: frame {row.token} has no box {row.box}. {AGAIN}."
-                )
+        problems += _check_rows(folder / PROVENANCE_FILE, rows, whole)
+    problems += _check_card(folder / JSON_FILE, card, whole)
+    boxes = sum(len(entry["gt_boxes"]) for entry in whole)
+    return SetReport(len(listed), count, boxes, tuple(problems))
+
+
+@dataclass(frozen=True)
+class Place:
+    """A frame of a split, as problems name it."""
+
+    folder: Path
+    split: str
+    number: int
+
+    @property
+    def v0(self) -> str:
+        """In BEVFormer's file."""
+        return f"{self.folder / v0_file(self.split)}: frame {self.number}"
+
+    @property
+    def v2(self) -> str:
+        """In mmdetection3d's file."""
+        return f"{self.folder / v2_file(self.split)}: frame {self.number}"
+
+
+def _read_split(folder: Path, split: str, problems: list[str]) -> tuple[list[Any], list[Any]]:
+    """The frames of both files of a split, paired; None where v2 has no frame of that number."""
+    entries = _read(problems, lambda: read_infos(folder / v0_file(split)).get("infos", [])) or []
+    others = _read(problems, lambda: read_infos(folder / v2_file(split)).get("data_list", [])) or []
+    if len(others) != len(entries):
+        problems.append(
+            f"{folder / v2_file(split)}: {len(others)} frames, {v0_file(split)} has {len(entries)}. {AGAIN}."
+        )
+    return entries, [*others[: len(entries)], *[None] * (len(entries) - len(others))]
+
+
+def _check_rows(path: Path, rows: Rows, entries: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """That provenance has no row without a box; that each box has a row is checked with its frame."""
+    counts = {str(entry["token"]): len(entry["gt_boxes"]) for entry in entries}
+    for (token, box), row in rows.items():
+        if not 0 <= box < counts.get(token, 0):
+            yield f"{path}: row {row.Index}: frame {token} has no box {box}. {AGAIN}."
+
+
+def _check_card(path: Path, card: Mapping[str, Any], entries: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """That the card counts the frames and boxes of each scene as the info files do."""
     for scene in card["scenes"]:
-        counted = tuple(scenes.get(scene["scene"], (0, 0)))
-        if counted != (scene["frames"], scene["boxes"]):
-            problems.append(
-                f"{folder / JSON_FILE}: scene {scene['scene']}: {scene['frames']} frames and {scene['boxes']} boxes, the info "
-                f"files have {counted[0]} and {counted[1]}. {AGAIN}."
+        boxes = [len(entry["gt_boxes"]) for entry in entries if entry["scene_token"] == scene["scene"]]
+        if (len(boxes), sum(boxes)) != (scene["frames"], scene["boxes"]):
+            yield (
+                f"{path}: scene {scene['scene']}: {scene['frames']} frames and {scene['boxes']} boxes, the info files "
+                f"have {len(boxes)} and {sum(boxes)}. {AGAIN}."
             )
-    return SetReport(len(listed), frames, boxes, tuple(problems))
 
 
-def _read(problems: list[str], read: Any) -> Any:
+def _read(problems: list[str], read: Callable[[], Any]) -> Any:
     """What `read` gives; None where it raises, which is a problem."""
     try:
         return read()
@@ -149,18 +171,20 @@ def _check_files(folder: Path, problems: list[str]) -> set[str]:
             content = (folder / name).read_bytes()
         except OSError as error:
             problems.append(
-                f"{folder / name}: cannot be read ({error.strerror}), and {FILES_FILE} lists it. Copy the folder again, whole."
+                f"{folder / name}: cannot be read ({error.strerror}), and {FILES_FILE} lists it. "
+                "Copy the folder again, whole."
             )
             continue
         if hashlib.sha256(content).hexdigest() != digest:
             problems.append(
-                f"{folder / name}: is not the file that was written (its SHA-256 differs). Copy the folder again, whole."
+                f"{folder / name}: is not the file that was written (its SHA-256 differs). "
+                "Copy the folder again, whole."
             )
     return set(listed)
 
 
 def _check_order(path: Path, entries: Sequence[Mapping[str, Any]], stamps: dict[int, str]) -> Iterator[str]:
-    """Unique, increasing stamps; scenes whole; frames of a scene numbered and linked. `stamps` are those of other splits."""
+    """Unique, increasing stamps; scenes whole, their frames numbered and linked. `stamps`: those of other splits."""
     ended: set[str] = set()
     before: Mapping[str, Any] | None = None
     for number, entry in enumerate(entries):
@@ -168,7 +192,7 @@ def _check_order(path: Path, entries: Sequence[Mapping[str, Any]], stamps: dict[
         try:
             token, scene, stamp = str(entry["token"]), str(entry["scene_token"]), int(entry["timestamp"])
             if stamp in stamps:
-                yield f"{where} ({token}): time stamp {stamp} is also that of {stamps[stamp]}; BEVFormer sorts by it. {AGAIN}."
+                yield f"{where} ({token}): time stamp {stamp} is that of {stamps[stamp]} too. {AGAIN}."
             stamps[stamp] = token
             same = before is not None and before["scene_token"] == scene
             if before is not None and int(before["timestamp"]) > stamp:
@@ -195,53 +219,60 @@ def _check_order(path: Path, entries: Sequence[Mapping[str, Any]], stamps: dict[
 
 
 def _check_frame(
-    folder: Path,
-    split: str,
-    number: int,
+    place: Place,
     entry: Mapping[str, Any],
     other: Mapping[str, Any] | None,
     card: Mapping[str, Any],
     listed: set[str],
-    by_box: Mapping[tuple[Any, Any], Any] | None,
-) -> Iterator[str]:
-    where = f"{folder / v0_file(split)}: frame {number} ({entry['token']})"
-    wrong = list(_check_arrays(where, entry, card))
-    yield from wrong
+    rows: Rows | None,
+) -> list[str]:
+    where = f"{place.v0} ({entry['token']})"
     camera = next(iter(entry["cams"].values()))
-    yield from _check_poses(where, entry, camera)
-    height, width = None, None
+    malformed = list(_check_arrays(where, entry, card))
+    problems = [*malformed, *_check_poses(where, entry, camera)]
     for path, kind in ((camera["data_path"], "image"), (entry["lidar_path"], "sweep")):
-        pure = PurePosixPath(path)
-        if pure.is_absolute() or ".." in pure.parts or "\\" in path:
-            yield f"{where}: {kind} path '{path}' leads out of the set; expected one from its folder. {AGAIN}."
-        elif not (folder / path).is_file():
-            yield (
-                f"{folder / path}: no such {kind}, and frame {number} of {v0_file(split)} ({entry['token']}) names it. "
-                "Copy the folder again, whole."
-            )
-        elif path not in listed and listed:
-            yield f"{where}: {kind} '{path}' is not in {FILES_FILE}. {AGAIN}."
-        elif kind == "image":
-            try:
-                height, width = read_image(folder / path).shape[:2]
-            except LogError as error:
-                yield str(error)
-        elif (folder / path).stat().st_size % (4 * len(POINT_FEATURES)):
-            yield f"{folder / path}: is no whole number of points of {len(POINT_FEATURES)} float32. {AGAIN}."
-        elif not wrong:
-            yield from _check_counts(where, folder / path, entry, by_box)
+        problems += _check_path(where, place.folder, path, kind, listed)
+    sweep = place.folder / entry["lidar_path"]
+    if not malformed and sweep.is_file() and sweep.stat().st_size % POINT_BYTES == 0:
+        problems += _check_counts(where, sweep, entry, rows)
     if other is None:
-        return
-    beside = f"{folder / v2_file(split)}: frame {number} ({entry['token']})"
-    yield from _check_agreement(beside, entry, camera, other, card)
+        return problems
     image = next(iter(other["images"].values()))
-    if height is not None and (height, width) != (image["height"], image["width"]):
+    problems += _check_agreement(f"{place.v2} ({entry['token']})", entry, camera, other, card)
+    problems += _check_image(place, camera["data_path"], image)
+    if not malformed:
+        problems += _check_projections(where, entry, camera, image["width"], image["height"])
+        problems += _check_provenance(where, place.split, entry, rows)
+    return problems
+
+
+def _check_path(where: str, folder: Path, path: str, kind: str, listed: set[str]) -> Iterator[str]:
+    """A path from the set's folder to a file in it that the set lists."""
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or "\\" in path:
+        yield f"{where}: its {kind}'s path '{path}' leads out of the set; expected one from its folder. {AGAIN}."
+    elif not (folder / path).is_file():
+        yield f"{folder / path}: no such {kind}, and {where} names it. Copy the folder again, whole."
+    elif path not in listed:
+        yield f"{where}: its {kind} '{path}' is not in {FILES_FILE}. {AGAIN}."
+    elif kind == "sweep" and (folder / path).stat().st_size % POINT_BYTES:
+        yield f"{folder / path}: is no whole number of points of {len(POINT_FEATURES)} float32. {AGAIN}."
+
+
+def _check_image(place: Place, path: str, image: Mapping[str, Any]) -> Iterator[str]:
+    """That an image decodes whole and has the size that v2 says."""
+    if not (place.folder / path).is_file():
+        return  # named with its path
+    try:
+        height, width = read_image(place.folder / path).shape[:2]
+    except LogError as error:
+        yield str(error)
+        return
+    if (height, width) != (image["height"], image["width"]):
         yield (
-            f"{beside}: height and width are {image['height']} and {image['width']}; the image is {height} x {width}. {AGAIN}."
+            f"{place.v2}: height and width are {image['height']} and {image['width']}; {path} is {height} x {width}. "
+            f"{AGAIN}."
         )
-    if not wrong:
-        yield from _check_projections(where, entry, camera, image["width"], image["height"])
-        yield from _check_provenance(where, entry, by_box)
 
 
 def _check_arrays(where: str, entry: Mapping[str, Any], card: Mapping[str, Any]) -> Iterator[str]:
@@ -273,7 +304,7 @@ def _check_arrays(where: str, entry: Mapping[str, Any], card: Mapping[str, Any])
     for box in range(count):
         at = f"{where}: box {box}"
         if not np.isfinite(boxes[box]).all():
-            yield f"{at}: {entry['gt_boxes'][box].tolist()} is not finite. Correct the log's annotation and write the set again."
+            yield f"{at}: {entry['gt_boxes'][box].tolist()} is not finite. Correct the log, and write the set again."
         elif np.any(boxes[box, 3:6] <= 0):
             yield f"{at}: a side is not above 0 m: {entry['gt_boxes'][box].tolist()}. Correct the log's annotation."
         elif np.any(boxes[box, :3] < low - SAME) or np.any(boxes[box, :3] > high + SAME):
@@ -294,22 +325,21 @@ def _check_poses(where: str, entry: Mapping[str, Any], camera: Mapping[str, Any]
         yield f"{where}: sensor2lidar is not what sensor2ego and both ego2global give. {AGAIN}."
 
 
-def _check_counts(
-    where: str, path: Path, entry: Mapping[str, Any], by_box: Mapping[tuple[Any, Any], Any] | None
-) -> Iterator[str]:
+def _check_counts(where: str, path: Path, entry: Mapping[str, Any], rows: Rows | None) -> Iterator[str]:
     """num_lidar_pts counted again in the points of the set; needs provenance, which knows whose points count."""
     points = np.fromfile(path, np.float32).reshape(-1, len(POINT_FEATURES))
     if not np.isfinite(points).all():
         yield f"{path}: row {int(np.argwhere(~np.isfinite(points))[0, 0])} is not finite. {AGAIN}."
         return
     for box, values in enumerate(other_layout(entry["gt_boxes"])):
-        row = by_box.get((entry["token"], box)) if by_box is not None else None
+        row = rows.get((entry["token"], box)) if rows is not None else None
         if row is None:
             continue
         lidar = -1 if row.lidar is None or row.lidar != row.lidar else int(row.lidar)
         counted = count_points(points, values, lidar)
         if counted != entry["num_lidar_pts"][box]:
-            yield f"{where}: box {box}: num_lidar_pts is {entry['num_lidar_pts'][box]}, {counted} points are in it. {AGAIN}."
+            stated = int(entry["num_lidar_pts"][box])
+            yield f"{where}: box {box}: num_lidar_pts is {stated}, but {counted} points are in it. {AGAIN}."
 
 
 def _check_projections(
@@ -329,13 +359,13 @@ def _check_projections(
         yield f"{where}: box {box}: no part of it is in the image. {AGAIN}."
 
 
-def _check_provenance(
-    where: str, entry: Mapping[str, Any], by_box: Mapping[tuple[Any, Any], Any] | None
-) -> Iterator[str]:
-    for box in range(len(entry["gt_boxes"]) if by_box is not None else 0):
-        row = by_box.get((entry["token"], box)) if by_box is not None else None
+def _check_provenance(where: str, split: str, entry: Mapping[str, Any], rows: Rows | None) -> Iterator[str]:
+    for box in range(len(entry["gt_boxes"]) if rows is not None else 0):
+        row = rows.get((entry["token"], box)) if rows is not None else None
         if row is None:
             yield f"{where}: box {box}: {PROVENANCE_FILE} has no row for it. {AGAIN}."
+        elif row.split != split:
+            yield f"{where}: box {box}: {PROVENANCE_FILE} has it in split {row.split}. {AGAIN}."
         elif row.origin not in ORIGINS:
             yield f"{where}: box {box}: its origin in {PROVENANCE_FILE} is '{row.origin}'. {AGAIN}."
         elif row.name != str(entry["gt_names"][box]):

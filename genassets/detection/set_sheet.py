@@ -68,7 +68,7 @@ def draw_frame(
     origins: Mapping[tuple[Any, Any], str],
     region: Sequence[Sequence[float]],
 ) -> Image:
-    """A frame's image with its boxes, and beside it the view from above; coloured by origin, grey where no point is inside."""
+    """A frame's image with its boxes beside the view from above; coloured by origin, grey where no point is inside."""
     import cv2
 
     camera = next(iter(entry["cams"].values()))
@@ -105,7 +105,7 @@ def draw_from_above(
     colours: Sequence[tuple[int, int, int]],
     region: Sequence[Sequence[float]],
 ) -> Image:
-    """The region of interest from above, x up and y to the left; points brighter the higher, boxes (N, 7) in layout v1."""
+    """The region of interest from above, x up, y to the left; points brighter the higher, boxes (N, 7) in layout v1."""
     import cv2
 
     (x0, x1), (y0, y1), (z0, z1) = region

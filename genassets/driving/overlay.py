@@ -71,7 +71,7 @@ def draw_edges(
     size: NDArray[np.float64],
     colour: tuple[int, int, int],
 ) -> None:
-    """Draw a box's edges into the image, cut at the near plane; its front is crossed, a line on its floor points there."""
+    """Draw a box into the image, cut at the near plane; its front is crossed, a line on its floor points there."""
     corners = box_corners(camera_from_box, size)
     width = max(1, round(image.shape[1] / 960))
     front_left, front_right, top_right, top_left = corners[list(FRONT_CORNERS)]

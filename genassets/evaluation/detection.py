@@ -1,7 +1,8 @@
 """Average precision of detected boxes by distance, as nuScenes defines it (detection challenge, 2019).
 
-A prediction matches by the distance of box centres on the ground, not by overlap. The paper takes the mean over 1, 2 and 4 m.
-nuScenes also drops boxes beyond a range that depends on the class, 50 m for cars; here the set's region of interest decides.
+A prediction matches by the distance of box centres on the ground, not by overlap. The paper takes the mean over 1,
+2 and 4 m. nuScenes also drops boxes beyond a range that depends on the class, 50 m for cars; here the set's region
+of interest decides.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ RECALLS = 101
 """Recalls 0, 0.01, .., 1 at which precision is taken."""
 LEAST_RECALL = 0.1
 LEAST_PRECISION = 0.1
-"""nuScenes counts neither a recall up to this one nor the precision below this one: what is left is scaled to reach 1."""
+"""nuScenes counts no recall up to this one and no precision below this one; the rest is scaled to reach 1."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,8 @@ class GroundTruth:
 class Predictions:
     """The detected boxes of one class over all samples.
 
-    sample: (M,), centre: (M, 2) as in GroundTruth. score: (M,), higher is surer; of equal scores the later counts first.
+    sample: (M,), centre: (M, 2) as in GroundTruth. score: (M,), higher is surer; of equal scores the later counts
+    first.
     Raises ValueError where shapes don't agree or a number is not finite: a detector whose training diverged.
     """
 
@@ -118,7 +120,8 @@ def precision_recall(
 def match(
     ground_truth: GroundTruth, predictions: Predictions, order: NDArray[np.int64], threshold: float
 ) -> NDArray[np.bool_]:
-    """Whether each prediction, in this order (M,), finds a true box (M,): the nearest of its sample that none before took.
+    """Whether each prediction, in this order (M,), finds a true box (M,): the nearest of its sample that none
+    before took.
 
     Nearer than `threshold`, not as near; of equally near boxes the first.
     """
