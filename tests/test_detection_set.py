@@ -26,7 +26,9 @@ from genassets.detection.provenance import PROVENANCE_SCHEMA, read_provenance
 from genassets.detection.set_card import read_card
 from genassets.detection.set_check import check_detection_set
 from genassets.driving.portable_pickle import pickle_portably
-from genassets.errors import DatasetError, LogError, SpecError
+from genassets.errors import DatasetError, LogError, SpecError, StageError
+from genassets.stages import write_dataset
+from genassets.stages.stage import Inputs, StageContext
 
 
 def build(root: Path, frames: int = 3, **options: Any) -> Path:
@@ -323,6 +325,30 @@ def test_the_sheet_shows_boxes_where_the_image_has_the_cars(written: Path) -> No
     orange = np.abs(sheet - (255, 150, 0)).sum(axis=2) < 60
     assert cyan[:, :800].sum() > 200 and orange[:, :800].sum() > 50
     assert cyan[:, 810:].sum() > 20 and orange[:, 810:].sum() > 5
+
+
+def ingested(root: Path, log: Path) -> Path:
+    """What the ingest stage leaves of a log."""
+    root.mkdir(parents=True)
+    (root / "log.json").write_text(json.dumps({"name": log.name, "kind": "pandaset", "path": str(log)}))
+    return root
+
+
+def test_the_stage_writes_a_whole_set(logs: dict[str, Path], tmp_path: Path) -> None:
+    shards = {name: ingested(tmp_path / "ingest" / name, logs[name]) for name in ("900", "901")}
+    context = StageContext(seed=0, shard=None, work_dir=tmp_path / "work")
+    out = tmp_path / "out"
+    out.mkdir()
+    metrics = write_dataset.run(
+        Inputs({"ingest": shards}), write_dataset.WriteDatasetConfig(val=("901",)), out, context
+    )
+    assert check_detection_set(out / "set").problems == ()
+    counts = {(metric.split, metric.metric): metric.value for metric in metrics}
+    assert counts["train", "boxes"] == 6 and counts["val", "frames"] == 3
+    with pytest.raises(StageError, match=r"write_dataset.val: the dataset has no log 7; there are 900, 901"):
+        write_dataset.run(
+            Inputs({"ingest": shards}), write_dataset.WriteDatasetConfig(val=("7",)), tmp_path, context
+        )
 
 
 @pytest.mark.slow

@@ -141,9 +141,9 @@ def markdown(card: SetCard) -> str:
         f"y {y0:g} to {y1:g}, z {z0:g} to {z1:g} m of the car's frame and that the image shows some part of. "
         f"Frames without a box: {'kept' if card.settings.empty_frames == 'keep' else 'dropped'}.",
         "",
-        "Frame of boxes and points: the car's at the frame's stamp, x forward, y left, z up, metres. One size an actor; "
-        "of boxes annotated twice, by both LiDARs, one. `num_lidar_pts` counts points of the LiDAR that the box was "
-        "fitted to.",
+        "Frame of boxes and points: the car's at the frame's stamp, levelled: x forward, y left, z up, metres. "
+        "One size an actor; of boxes annotated twice, by both LiDARs, one. `num_lidar_pts` counts points of the LiDAR "
+        "that the box was fitted to.",
         "",
         "| file | for |",
         "|---|---|",

@@ -21,6 +21,7 @@ from genassets.stages import (
     reconstruct,
     train_prior,
     turntables,
+    write_dataset,
 )
 from genassets.stages.stage import Stage
 
@@ -39,6 +40,7 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_sampling.STAGE,
     evaluate_completion.STAGE,
     evaluate_speed_error.STAGE,
+    write_dataset.STAGE,
 )
 
 
