@@ -115,9 +115,9 @@ def plan_scenes(train: Sequence[Path], val: Sequence[Path]) -> list[Scene]:
             number = 1 + sum(other.startswith(f"{name}-aug") for other in names)
             name = f"{name}-aug{number}"
         if name in names:
-            other = logs[names.index(name)].root
+            first = logs[names.index(name)].root
             raise DatasetError(
-                f"{log.root}: two logs are named {name}, the other is {other}; rename a directory, or leave one out."
+                f"{log.root}: two logs are named {name}, the other is {first}; rename a directory, or leave one out."
             )
         names.append(name)
     for log in logs:

@@ -49,12 +49,15 @@ def draw_set_sheet(folder: Path, samples: int = 4) -> bytes:
     ]
     shown = [pair for pair in entries if len(pair[1]["gt_boxes"])] or entries
     origins = {
-        (row.token, row.box): row.origin
+        (str(row.token), int(row.box)): str(row.origin)  # type: ignore[arg-type]
         for row in read_provenance(folder / PROVENANCE_FILE).itertuples(index=False)
     }
     region = read_card(folder)["settings"]["region"]
     places = np.unique(np.linspace(0, len(shown) - 1, min(samples, len(shown))).round().astype(int))
-    rows = [draw_frame(folder, *shown[place], origins, region) for place in places]
+    rows = []
+    for place in places:
+        split, entry = shown[place]
+        rows.append(draw_frame(folder, split, entry, origins, region))
     width = max(row.shape[1] for row in rows)
     sheet = np.concatenate([np.pad(row, ((0, 4), (0, width - row.shape[1]), (0, 0))) for row in rows])
     _, encoded = cv2.imencode(".png", np.ascontiguousarray(sheet[..., ::-1]))
@@ -65,7 +68,7 @@ def draw_frame(
     folder: Path,
     split: str,
     entry: Mapping[str, Any],
-    origins: Mapping[tuple[Any, Any], str],
+    origins: Mapping[tuple[str, int], str],
     region: Sequence[Sequence[float]],
 ) -> Image:
     """A frame's image with its boxes beside the view from above; coloured by origin, grey where no point is inside."""
@@ -74,10 +77,8 @@ def draw_frame(
     camera = next(iter(entry["cams"].values()))
     image = read_image(folder / camera["data_path"])
     height, width = image.shape[:2]
-    calibration = camera["cam_intrinsic"]
-    intrinsics = Intrinsics(
-        *(float(calibration[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2))), width=width, height=height
-    )
+    k = np.asarray(camera["cam_intrinsic"], np.float64)
+    intrinsics = Intrinsics(float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]), width, height)
     camera_from_lidar = invert_pose(sensor_to_lidar(camera))
     boxes = other_layout(entry["gt_boxes"])
     colours = [
@@ -87,16 +88,15 @@ def draw_frame(
     for box in np.argsort(-boxes[:, 0]):
         pose, size = pose_and_size(boxes[box])
         draw_edges(image, intrinsics, camera_from_lidar @ pose, size, colours[box])
-    image = cv2.resize(
-        image, (round(width * TILE_HEIGHT / height), TILE_HEIGHT), interpolation=cv2.INTER_AREA
-    )
+    shown = (round(width * TILE_HEIGHT / height), TILE_HEIGHT)
+    tile = np.asarray(cv2.resize(image, shown, interpolation=cv2.INTER_AREA), np.uint8)
     points = np.fromfile(folder / entry["lidar_path"], np.float32).reshape(-1, len(POINT_FEATURES))
     above = draw_from_above(points, boxes, colours, region)
     text = f"{split} {entry['token']}: {len(boxes)} boxes, {int(np.sum(entry['valid_flag']))} with points"
-    band = image[:26]
+    band = tile[:26]
     band[:] = band // 3
-    cv2.putText(image, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
-    return np.concatenate([image, np.zeros((TILE_HEIGHT, 4, 3), np.uint8), above], axis=1)
+    cv2.putText(tile, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return np.concatenate([tile, np.zeros((TILE_HEIGHT, 4, 3), np.uint8), above], axis=1)
 
 
 def draw_from_above(

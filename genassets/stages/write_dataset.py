@@ -21,9 +21,11 @@ class WriteDatasetConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    camera: CameraName = Field("front_camera", description="Whose images.")
-    val: tuple[str, ...] = Field((), description="Logs to validate on, by name; the others train.")
-    empty_frames: Literal["keep", "drop"] = Field("keep", description="Frames without a box: keep or drop.")
+    camera: CameraName = Field(default="front_camera", description="Whose images.")
+    val: tuple[str, ...] = Field(default=(), description="Logs to validate on, by name; the others train.")
+    empty_frames: Literal["keep", "drop"] = Field(
+        default="keep", description="Frames without a box: keep or drop."
+    )
 
 
 def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageContext) -> list[Metric]:
