@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 from tiny_prior import ACTORS, TIMES, TINY, codes_of, learn, make_library
 from tiny_reconstruction import SETTINGS, changed
 
+from genassets.checkpoint import save_checkpoint
 from genassets.driving.classes import CLASSES
 from genassets.errors import SpecError, StageError
 from genassets.geometry.turntable import turntable_camera
@@ -27,7 +28,6 @@ from genassets.prior.pull import DiffusionPull
 from genassets.prior.sampling import BATCH, SampleNoise, Samples, draw_conditions, sample, unseen_together
 from genassets.prior.settings import NetworkSettings, PriorSettings, SamplingSettings
 from genassets.prior.training import PriorTrainer, train_prior, velocity_loss
-from genassets.reconstruction.checkpoint import save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.library import AssetLibrary, load_library, save_library
 from genassets.reconstruction.scene_renderer import SceneRenderer

@@ -29,6 +29,8 @@ Split = Literal["train", "val"]
 
 SPLITS: tuple[Split, ...] = ("train", "val")
 VERSION = "genassets-1"
+SET_FOLDER = "set"
+"""Where a stage's output has its detector set."""
 IMAGE_FOLDER = "images"
 SWEEP_FOLDER = "lidar"
 

@@ -8,6 +8,7 @@ from pydantic import BaseModel
 
 from genassets.stages import (
     evaluate_completion,
+    evaluate_detector,
     evaluate_generation,
     evaluate_reconstruction,
     evaluate_sampling,
@@ -19,6 +20,7 @@ from genassets.stages import (
     ingest,
     prepare_masks,
     reconstruct,
+    train_detector,
     train_prior,
     turntables,
     write_dataset,
@@ -41,6 +43,8 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_completion.STAGE,
     evaluate_speed_error.STAGE,
     write_dataset.STAGE,
+    train_detector.STAGE,
+    evaluate_detector.STAGE,
 )
 
 

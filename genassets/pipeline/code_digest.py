@@ -16,11 +16,12 @@ from genassets.errors import StageError
 from genassets.pipeline.file_digests import FileMemory
 
 PACKAGE = "genassets"
-# Message texts, the stage contract, the version and the fetching of files (whose bytes are pinned) carry no
-# numbers; a change in them must not rerun stages.
+# Message texts, the stage contract, the version, the fetching of files (whose bytes are pinned) and checkpoints (which
+# keep numbers as they are) carry none of their own; a change in them must not rerun stages.
 WITHOUT_EFFECT = frozenset(
     {
         "genassets",
+        "genassets.checkpoint",
         "genassets.errors",
         "genassets.package_archive",
         "genassets.stages",

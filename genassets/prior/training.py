@@ -20,14 +20,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from genassets.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.errors import StageError
 from genassets.prior.conditions import Conditions
 from genassets.prior.library_codes import LibraryCodes, held_out
 from genassets.prior.model import AssetPrior, Moments
 from genassets.prior.sampling import Samples, draw_conditions, sample
 from genassets.prior.settings import PriorSettings, SamplingSettings
-from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
-from genassets.reconstruction.pages import Pages
 
 CURVE_EVERY = 20
 LARGEST_NORM = 1.0
@@ -65,7 +64,7 @@ class Look:
 class PriorTrainer:
     """Prior, optimiser, moving average and step counter; everything random in a step comes from (seed, step)."""
 
-    pages: Pages | None = None
+    pages = None
 
     def __init__(self, codes: LibraryCodes, settings: PriorSettings, seed: int) -> None:
         self.settings, self.seed = settings, seed

@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 from torch.nn.utils import get_total_norm
 
+from genassets.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.driving import CLASSES
 from genassets.errors import StageError
 from genassets.fields.row_blocks import Place, in_memory
 from genassets.fields.triplane import half_planes
 from genassets.reconstruction.adversary import Adversary
-from genassets.reconstruction.checkpoint import restore_checkpoint, save_checkpoint
 from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.model import AssetModel
 from genassets.reconstruction.objective import Objective, StepResult

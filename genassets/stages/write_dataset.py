@@ -13,8 +13,6 @@ from pydantic import BaseModel, ConfigDict, Field
 from genassets.specs.split import CameraName
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 
-SET_FOLDER = "set"
-
 
 class WriteDatasetConfig(BaseModel):
     """Settings of the detector set."""
@@ -31,6 +29,7 @@ class WriteDatasetConfig(BaseModel):
 def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageContext) -> list[Metric]:
     """Write the set; StageError where `val` names no log of the dataset, else errors as in write_detection_set."""
     from genassets.detection.detection_set import SHEET_FILE, write_detection_set
+    from genassets.detection.info_files import SET_FOLDER
     from genassets.detection.labels import LabelSettings
     from genassets.driving.image import read_image
     from genassets.errors import StageError

@@ -14,16 +14,25 @@ from typing import Any, Protocol
 import torch
 
 from genassets.errors import StageError
-from genassets.reconstruction.pages import Pages
 
 CHECKPOINT = "checkpoint.pt"
+
+
+class Paged(Protocol):
+    """State that lies in files of its own."""
+
+    def copy_to(self, path: Path) -> None: ...
+
+    def restore(self, path: Path) -> None: ...
 
 
 class Resumable(Protocol):
     """A training that can be continued from its state; pages hold what the state leaves out, where there are any."""
 
     step: int
-    pages: Pages | None
+
+    @property
+    def pages(self) -> Paged | None: ...
 
     def state(self) -> dict[str, Any]: ...
 

@@ -1,0 +1,58 @@
+"""BEVFormer-tiny for a single frame of one camera, in plain torch: backbone, neck, encoder, decoder."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from genassets.detection.backbone import BACKBONES, EfficientNetLite0, freeze
+from genassets.detection.decoder import Decoder, Guesses
+from genassets.detection.encoder import Encoder
+from genassets.detection.settings import DetectorSettings
+
+
+class Detector(nn.Module):
+    """Boxes from images and their projections.
+
+    Raises:
+        WeightsError: the backbone is to start from its pinned file, and that is not there.
+    """
+
+    def __init__(self, settings: DetectorSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.backbone = BACKBONES[settings.backbone](settings.stride)
+        if settings.pretrained:
+            assert isinstance(self.backbone, EfficientNetLite0)
+            self.backbone.load_pinned()
+            freeze(self.backbone)
+        channels = settings.channels
+        neck = (nn.Conv2d(self.backbone.channels, channels, 1), nn.Conv2d(channels, channels, 3, padding=1))
+        self.neck = nn.Sequential(*neck)
+        for layer in neck:
+            assert layer.bias is not None
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
+        self.encoder, self.decoder = Encoder(settings), Decoder(settings)
+
+    def train(self, mode: bool = True) -> Self:
+        """As of any module, save that a pretrained backbone's norms keep the statistics that they came with."""
+        super().train(mode)
+        if self.settings.pretrained:
+            self.backbone.eval()
+        return self
+
+    def forward(
+        self, images: Float[Tensor, "batch 3 height width"], image_from_ego: Float[Tensor, "batch 4 4"]
+    ) -> list[Guesses]:
+        """Guesses of every decoder layer, the last one's last.
+
+        images: standardised (backbone.py), zero where padded, sides multiples of 32. image_from_ego: homogeneous
+        pixels of these images (0 at the left and upper edge) from metres of the ego frame.
+        """
+        height, width = images.shape[-2:]
+        features = self.neck(self.backbone(images))
+        plane = self.encoder(features, image_from_ego, width, height)
+        return self.decoder(plane)
