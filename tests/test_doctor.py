@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import subprocess
 import sys
@@ -122,13 +123,13 @@ def test_doctor_names_a_package_outside_its_bounds_and_one_that_was_not_tried(
 
     def version(name: str) -> str:
         if name not in installed:
-            raise doctor.metadata.PackageNotFoundError(name)
+            raise importlib.metadata.PackageNotFoundError(name)
         return installed[name]
 
     monkeypatch.setattr(
-        doctor.metadata, "requires", lambda _: ["pyarrow>=18,<26", "numpy>=2.0", "mlflow>=3.17"]
+        importlib.metadata, "requires", lambda _: ["pyarrow>=18,<26", "numpy>=2.0", "mlflow>=3.17"]
     )
-    monkeypatch.setattr(doctor.metadata, "version", version)
+    monkeypatch.setattr(importlib.metadata, "version", version)
     found = {finding.subject: finding for finding in doctor._requirements()}
     assert found["pyarrow"].state == "missing" and "<26" in found["pyarrow"].cost
     assert found["numpy"].state == "note" and "constraints.txt" in found["numpy"].cost

@@ -12,7 +12,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -90,6 +89,8 @@ def _python() -> Finding:
 
 def _requirements() -> Iterator[Finding]:
     """Each dependency of the package against its bounds, and against constraints.txt, tried together."""
+    from importlib import metadata
+
     from packaging.requirements import Requirement
 
     tried = _constraints()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,16 +49,17 @@ def code_trees(
 
     ``source_root`` is the directory that holds the package's directory. Modules that roots share are looked at once.
     """
+    files = module_files(source_root)
     looked: dict[str, tuple[str, list[str]] | None] = {}
 
     def look(name: str) -> tuple[str, list[str]] | None:
         if name not in looked:
-            path = module_file(name, source_root)
-            looked[name] = (
-                None
-                if path is None
-                else memory.of(path, _digest_and_imports(name, path.name == "__init__.py"))
-            )
+            path = files.get(name)
+            if path is None:
+                looked[name] = None
+            else:
+                digest, imported = memory.of(path, _digest_and_imports(name, path.name == "__init__.py"))
+                looked[name] = digest, [module for module in imported if module in files]
         return looked[name]
 
     return {roots: _reached(roots, look) for roots in all_roots}
@@ -82,16 +84,21 @@ def _reached(roots: CodeRoots, look: Callable[[str], tuple[str, list[str]] | Non
     return dict(sorted(digests.items()))
 
 
-def module_file(name: str, source_root: Path) -> Path | None:
-    """File of a module or package, or None where the name is an attribute or lies outside the package."""
-    if name.partition(".")[0] != PACKAGE:
-        return None
-    # Asked for each name that any module imports, so paths are built from one string.
-    base = f"{source_root}/{name.replace('.', '/')}"
-    for path in (Path(f"{base}.py"), Path(f"{base}/__init__.py")):
-        if path.is_file():
-            return path
-    return None
+def module_files(source_root: Path) -> dict[str, Path]:
+    """File of each module and package of the package, by dotted name.
+
+    One walk, for planning asks for every name that any module imports, attributes among them.
+    """
+    files: dict[str, Path] = {}
+    for folder, inner, names in os.walk(source_root / PACKAGE):
+        inner[:] = [name for name in inner if name.isidentifier() and name != "__pycache__"]
+        package = os.path.relpath(folder, source_root).replace(os.sep, ".")
+        for name in names:
+            if name == "__init__.py":
+                files[package] = Path(folder, name)
+            elif name.endswith(".py"):
+                files.setdefault(f"{package}.{name.removesuffix('.py')}", Path(folder, name))
+    return files
 
 
 def code_digest_of(text: str) -> str:

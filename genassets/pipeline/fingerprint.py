@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import importlib.metadata
 import json
-from collections.abc import Iterator, Mapping
+import os
+import sys
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from pydantic import BaseModel
@@ -20,14 +21,27 @@ NUMERIC_LIBRARIES = ("numpy", "onnxruntime", "torch")
 @functools.cache
 def numeric_environment() -> dict[str, str]:
     """Major and minor version of each numeric library."""
-    versions: dict[str, str] = {}
-    for library in NUMERIC_LIBRARIES:
+    installed = installed_versions(NUMERIC_LIBRARIES)
+    return {name: ".".join(installed[name].split("+")[0].split(".")[:2]) for name in NUMERIC_LIBRARIES}
+
+
+def installed_versions(libraries: Collection[str]) -> dict[str, str]:
+    """Version of each installed library, "absent" for others.
+
+    Read from the names of the directories NAME-VERSION.dist-info (PEP 427), the first on the path as in an import:
+    importlib.metadata would parse each library's whole description, which takes a tenth of what a plan takes.
+    """
+    found: dict[str, str] = {}
+    for folder in sys.path:
         try:
-            version = importlib.metadata.version(library)
-        except importlib.metadata.PackageNotFoundError:
-            version = "absent"
-        versions[library] = ".".join(version.split("+")[0].split(".")[:2])
-    return versions
+            names = os.listdir(folder or ".")  # noqa: PTH208 (no Path an entry: a thousand of them)
+        except OSError:
+            continue  # a zip file, or a directory that is not there
+        for name in names:
+            library, dash, version = name.removesuffix(".dist-info").partition("-")
+            if dash and name.endswith(".dist-info") and library in libraries:
+                found.setdefault(library, version)
+    return {library: found.get(library, "absent") for library in libraries}
 
 
 def components(
