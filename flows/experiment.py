@@ -22,6 +22,9 @@ def experiment(
     track: bool = True,
     run_id: str | None = None,
     resumes: str | None = None,
+    force: list[str] | None = None,
+    accept_code: list[str] | None = None,
+    retries: str | None = None,
 ) -> Any:
     """Run an experiment by the name or path of its spec.
 
@@ -32,8 +35,22 @@ def experiment(
         track: record the run in MLflow.
         run_id: directory of the run below runs/, already made; a new one by default.
         resumes: id of the earlier run to go on with; its record says which stages.
+        force: run these stages again; what hangs on them follows where their content changes.
+        accept_code: take what other code made for these stages.
+        retries: id of the earlier run of which nothing but the failed steps are tried again.
     """
-    request = RunRequest(spec, tuple(overrides or ()), start_from, only, "prefect", track, resumes)
+    request = RunRequest(
+        spec,
+        tuple(overrides or ()),
+        start_from,
+        only,
+        "prefect",
+        track,
+        resumes,
+        tuple(force or ()),
+        tuple(accept_code or ()),
+        retries,
+    )
     prepared = prepare(request, run_id)
     with ProgressDisplay() as display:
         code = launch(prepared, [display], run_as_task)

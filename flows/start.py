@@ -68,6 +68,9 @@ def run_flow(request: RunRequest) -> RunRecord:
             track=request.track,
             run_id=directory.name,
             resumes=request.resumes,
+            force=list(request.force),
+            accept_code=list(request.accept_code),
+            retries=request.retries,
             return_state=True,
         )
         record = RunRecord.load(directory)

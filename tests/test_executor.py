@@ -205,10 +205,17 @@ def test_a_run_whose_process_is_gone_is_dead(tmp_path: Path) -> None:
     record = start_record(toy_workflow(tmp_path))
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    record.pid = gone.pid
-    elsewhere = dataclasses.replace(record, host="another")
-    alive = dataclasses.replace(record, pid=os.getpid())
-    assert [found.is_dead for found in (record, elsewhere, alive)] == [True, False, False]
+    here = record.process
+    marks = {
+        "gone": dataclasses.replace(here, pid=gone.pid),
+        "number given to another": dataclasses.replace(here, ticks=1),
+        "before the machine was started": dataclasses.replace(here, boot="another"),
+        "alive": here,
+        "elsewhere": dataclasses.replace(here, host="another", pid=gone.pid),
+        "in a container": dataclasses.replace(here, namespace="another", pid=gone.pid),
+    }
+    dead = {name: dataclasses.replace(record, process=mark).is_dead for name, mark in marks.items()}
+    assert [name for name, is_dead in dead.items() if is_dead] == list(marks)[:3]
 
 
 def test_runs_are_found_by_the_start_of_their_name(tmp_path: Path) -> None:
@@ -224,4 +231,4 @@ def test_runs_are_found_by_the_start_of_their_name(tmp_path: Path) -> None:
         find_run(tmp_path, newest.name[:4])
     with pytest.raises(SpecError, match="is not one of"):
         find_run(tmp_path, "zzz")
-    assert os.getpid() == RunRecord.load(newest).pid
+    assert os.getpid() == RunRecord.load(newest).process.pid

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from genassets.errors import SpecError
-from genassets.pipeline.explanation import explain_plan
+from genassets.pipeline.explanation import Explanation, explain_plan
 from genassets.pipeline.plan import Selection, make_plan
 from tests.toy_pipeline import SPEC, run_toy, toy_workflow
 
@@ -24,6 +24,10 @@ def actions(home: Path, *overrides: str, selection: Selection = Selection()) -> 
 
 def reasons(home: Path, *overrides: str) -> dict[str, str]:
     return {item.step.key: item.reason for item in make_plan(toy_workflow(home, overrides))}
+
+
+def words(found: list[Explanation]) -> list[str]:
+    return [line for item in found for line in item.lines()]
 
 
 def test_a_new_store_has_nothing(tmp_path: Path) -> None:
@@ -87,13 +91,13 @@ def test_wanted_stages_bring_what_they_need(tmp_path: Path) -> None:
 def test_explain_compares_with_the_nearest_object(tmp_path: Path) -> None:
     run_toy(tmp_path)
     run_toy(tmp_path, ["total.scale=7", "seed=5"])
-    lines = list(explain_plan(toy_workflow(tmp_path, ["total.scale=2"]), "total"))
+    lines = words(explain_plan(toy_workflow(tmp_path, ["total.scale=2"]), "total"))
     assert lines[0] == "total: run: changed: config/scale 1.0 -> 2.0"
     assert lines[2:] == ["  config/scale 1.0 -> 2.0"], "the object of seed 0 is nearer than that of seed 5"
-    cached = list(explain_plan(toy_workflow(tmp_path), "total"))
+    cached = words(explain_plan(toy_workflow(tmp_path), "total"))
     assert cached[0] == "total: cached: the store has it"
     with pytest.raises(SpecError, match="its stages are numbers, total, report"):
-        list(explain_plan(toy_workflow(tmp_path), "totl"))
+        explain_plan(toy_workflow(tmp_path), "totl")
 
 
 HEAVY = "numpy torch prefect mlflow open3d cv2 pandas pyarrow onnxruntime scipy matplotlib PIL skimage"
@@ -131,4 +135,5 @@ def test_plan_as_json(tmp_path: Path) -> None:
     )
     document = json.loads(done.stdout)
     assert document["experiment"] == "demo"
-    assert {"name", "shard", "action", "reason", "fingerprint", "path"} == set(document["steps"][0])
+    expected = {"name", "shard", "action", "reason", "fingerprint", "path", "expected_seconds", "replaces"}
+    assert expected == set(document["steps"][0])

@@ -20,10 +20,13 @@ import typer
 from genassets import __version__
 from genassets.cli import dataset, weights
 from genassets.cli.bench import bench
+from genassets.cli.compare import compare
 from genassets.cli.complete import complete
 from genassets.cli.doctor import doctor
 from genassets.cli.explain import explain
 from genassets.cli.export import export
+from genassets.cli.flow import flow
+from genassets.cli.gc import gc
 from genassets.cli.generate import generate
 from genassets.cli.hard_cases import hard_cases
 from genassets.cli.inspect import inspect
@@ -31,6 +34,7 @@ from genassets.cli.list import list_runs
 from genassets.cli.plan import plan
 from genassets.cli.report import report
 from genassets.cli.resume import resume
+from genassets.cli.retry import retry
 from genassets.cli.run import run
 from genassets.cli.schema import schema
 from genassets.cli.speed_error import speed_error
@@ -75,14 +79,18 @@ def _options(
 
 app.command("run")(run)
 app.command("plan")(plan)
+app.command("flow")(flow)
 app.command("status")(status)
 app.command("explain")(explain)
 app.command("resume")(resume)
+app.command("retry")(retry)
+app.command("compare")(compare)
 app.command("report")(report)
 app.command("export")(export)
 app.command("table")(table)
 app.command("list")(list_runs)
 app.command("verify")(verify)
+app.command("gc")(gc)
 app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)

@@ -8,15 +8,18 @@ import shlex
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from genassets.errors import SpecError
+from genassets.errors import GenAssetsError, SpecError
 from genassets.pipeline.catalog import CATALOG, configs
 from genassets.pipeline.executor import Engine, RunListener, execute, run_inline
+from genassets.pipeline.fingerprint import differences
+from genassets.pipeline.heartbeat import Heartbeat
 from genassets.pipeline.home import Home
-from genassets.pipeline.plan import Selection, Workflow
+from genassets.pipeline.plan import Selection, Workflow, describe_value
 from genassets.pipeline.preflight import check_needs
 from genassets.pipeline.run_record import (
     SPEC_FILE,
@@ -27,7 +30,9 @@ from genassets.pipeline.run_record import (
     save_spec,
 )
 from genassets.pipeline.store import StoredObject
+from genassets.specs.document import read_document
 from genassets.specs.experiment import Experiment, load_experiment
+from genassets.tracking.dead_runs import settle_dead_runs
 
 log = logging.getLogger("genassets.launch")
 
@@ -38,7 +43,8 @@ LOG_FILE = "run.log"
 class RunRequest:
     """What a person asked for: a spec by name or path, overrides, and which stages.
 
-    ``resumes`` is the id of the run to go on with; its record says which stages.
+    ``resumes`` is the id of the run to go on with; its record says which stages. ``retries`` is the id of the run of
+    which nothing but the failed steps are tried again.
     """
 
     spec: str
@@ -48,6 +54,9 @@ class RunRequest:
     engine: str = "inline"
     track: bool = True
     resumes: str | None = None
+    force: tuple[str, ...] = ()
+    accept_code: tuple[str, ...] = ()
+    retries: str | None = None
 
 
 @dataclass(frozen=True)
@@ -69,12 +78,35 @@ def load_workflow(request: RunRequest) -> Workflow:
 
 
 def _selection(request: RunRequest, runs: Path) -> Selection:
-    if request.resumes is None:
-        return Selection(request.start_from, request.only)
-    record = RunRecord.load(runs / request.resumes)
-    made = frozenset(step.key for step in record.stages if step.status == "completed")
-    begun = frozenset(step.key for step in record.stages if step.status not in ("pending", "skipped"))
-    return Selection(record.start_from, record.only, made, begun)
+    earlier = request.resumes or request.retries
+    if earlier is None:
+        return Selection(request.start_from, request.only, request.force, request.accept_code)
+    record = RunRecord.load(runs / earlier)
+    return Selection(
+        record.start_from,
+        record.only,
+        record.force,
+        tuple(dict.fromkeys((*record.accept_code, *request.accept_code))),
+        retry=_failed_steps(record) if request.retries else frozenset(),
+        made=frozenset(step.key for step in record.stages if step.status == "completed"),
+        begun=frozenset(step.key for step in record.stages if step.status not in ("pending", "skipped")),
+    )
+
+
+def _failed_steps(record: RunRecord) -> frozenset[str]:
+    """Keys of the steps that failed, and of those that failed shards kept from running.
+
+    Raises:
+        SpecError: there are none.
+    """
+    failed = {step.key for step in record.stages if step.status in ("failed", "interrupted", "crashed")}
+    waiting = {step.key for step in record.stages if step.status == "skipped" and step.shard is not None}
+    if not failed:
+        raise SpecError(
+            f"run {record.run_id} is {record.status}: none of its steps failed; to go on with it: genassets resume "
+            f"{record.run_id}"
+        )
+    return frozenset(failed | waiting)
 
 
 def load_resolved(run_directory: Path) -> Experiment:
@@ -83,17 +115,20 @@ def load_resolved(run_directory: Path) -> Experiment:
 
 
 def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
-    """Validate a request and make the run's resolved spec and record.
+    """Validate a request and make the run's resolved spec and record; runs that died before are set to crashed.
 
     Args:
         run_id: name of a directory already made for it below runs/; a new one by default.
     """
     workflow = load_workflow(request)
     check_needs(workflow)
+    settle_dead_runs(workflow.home)
     name = workflow.experiment.header.name
     runs = workflow.home.runs
     directory = new_run_directory(runs, name) if run_id is None else runs / run_id
-    save_spec(directory, workflow.experiment.resolved())
+    resolved = workflow.experiment.resolved()
+    save_spec(directory, resolved)
+    source, overrides = _source(request, runs)
     record = RunRecord(
         run_id=directory.name,
         directory=directory,
@@ -104,9 +139,25 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         stages=[StepRecord(step.stage.name, step.shard) for step in workflow.steps()],
         start_from=workflow.selection.start_from,
         only=workflow.selection.only,
+        force=workflow.selection.force,
+        accept_code=workflow.selection.accept_code,
+        retries=request.retries,
+        source=source,
+        overrides=overrides,
+        spec=resolved,
     )
     record.save()
     return PreparedRun(request, workflow, record)
+
+
+def _source(request: RunRequest, runs: Path) -> tuple[str | None, tuple[str, ...]]:
+    """What the spec was first made from: an experiment's name or the absolute path of its file, and the overrides."""
+    earlier = request.resumes or request.retries
+    if earlier is not None:
+        record = RunRecord.load(runs / earlier)
+        return record.source, record.overrides
+    path = Path(request.spec)
+    return str(path.absolute()) if path.is_file() else request.spec, request.overrides
 
 
 def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine: Engine = run_inline) -> int:
@@ -119,7 +170,8 @@ def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine:
             from genassets.tracking.mlflow_listener import MlflowListener
 
             watching.append(MlflowListener(prepared.workflow.home))
-        return execute(prepared.workflow, record, watching, engine)
+        with Heartbeat(record.directory):
+            return execute(prepared.workflow, record, watching, engine)
     except BaseException as error:
         if record.status == "running":
             record.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
@@ -163,10 +215,84 @@ class ReportWriter:
         record.save()
 
 
-def resume_request(run: str | None, engine: str, track: bool) -> RunRequest:
-    """The request that goes on with a run: its resolved spec, its --from or --only, what it did not finish."""
-    directory = find_run(Home.from_environment().runs, run)
-    return RunRequest(str(directory / SPEC_FILE), engine=engine, track=track, resumes=directory.name)
+def resume_request(
+    run: str | None,
+    engine: str,
+    track: bool,
+    accept_code: tuple[str, ...] = (),
+    as_saved: bool = False,
+) -> RunRequest:
+    """The request that goes on with a run: its resolved spec, its --from or --only, what it did not finish.
+
+    Of a run that retried another's failed steps, that other one is meant.
+
+    Args:
+        as_saved: go on even where the experiment has been edited since.
+
+    Raises:
+        SpecError: the run's spec.yaml was edited, or the experiment that it came from.
+    """
+    runs = Home.from_environment().runs
+    record = RunRecord.load(find_run(runs, run))
+    while record.retries is not None:
+        record = RunRecord.load(find_run(runs, record.retries))
+    check_saved_spec(record, as_saved)
+    return RunRequest(
+        str(record.directory / SPEC_FILE),
+        engine=engine,
+        track=track,
+        resumes=record.run_id,
+        accept_code=accept_code,
+    )
+
+
+def retry_request(run: str | None, engine: str, track: bool) -> RunRequest:
+    """The request that tries the failed steps of a run again, and nothing else.
+
+    Raises:
+        SpecError: none failed, or the run's spec was edited.
+    """
+    record = RunRecord.load(find_run(Home.from_environment().runs, run))
+    check_saved_spec(record, as_saved=True)
+    _failed_steps(record)
+    return RunRequest(str(record.directory / SPEC_FILE), engine=engine, track=track, retries=record.run_id)
+
+
+def check_saved_spec(record: RunRecord, as_saved: bool) -> None:
+    """Compare a run's spec with its spec.yaml, and unless ``as_saved`` with the experiment it came from.
+
+    Raises:
+        SpecError: they differ; shows each field.
+    """
+    if record.spec is None:
+        return  # of a version that did not note it
+    if edited := _fields_that_differ(record.spec, read_document(record.directory / SPEC_FILE).values):
+        raise SpecError(
+            f"{record.directory / SPEC_FILE} is no longer what the run was started with:\n{edited}\n"
+            f"put it back to go on with the run, or start another: genassets run {record.directory / SPEC_FILE}"
+        )
+    if as_saved or record.source is None:
+        return
+    try:
+        now = load_experiment(record.source, configs(CATALOG), record.overrides).resolved()
+    except GenAssetsError as error:
+        log.info("the experiment of run %s cannot be read any more: %s", record.run_id, error)
+        return  # the saved spec is whole without it
+    # Both as this code resolves them, so that a setting that is new in the code is no difference.
+    if changed := _fields_that_differ(load_resolved(record.directory).resolved(), now):
+        options = "".join(f" --set {shlex.quote(override)}" for override in record.overrides)
+        raise SpecError(
+            f"experiment {record.source} has changed since run {record.run_id} (then -> now):\n{changed}\n"
+            f"go on as it was: genassets resume {record.run_id} --as-saved; run what it is now: genassets run "
+            f"{record.source}{options}"
+        )
+
+
+def _fields_that_differ(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
+    return "\n".join(
+        f"  {name.replace('/', '.')}: {describe_value(old)} -> {describe_value(new)}"
+        for name, old, new in differences(before, after)
+    )
 
 
 def _log_to(path: Path) -> logging.Handler:

@@ -12,14 +12,16 @@ def list_runs(as_json: AsJson = False) -> None:
     from genassets.pipeline.home import Home
     from genassets.pipeline.run_record import RunRecord
     from genassets.pipeline.run_record import list_runs as find_runs
+    from genassets.tracking.dead_runs import settle_dead_runs
 
     home = Home.from_environment()
-    records = [RunRecord.load(path) for path in find_runs(home.runs)]
+    crashed = {record.run_id: record for record in settle_dead_runs(home)}
+    records = [crashed.get(path.name) or RunRecord.load(path) for path in find_runs(home.runs)]
     rows = [
         {
             "run_id": record.run_id,
             "experiment": record.experiment,
-            "status": "crashed" if record.is_dead else record.status,
+            "status": record.status,
             "seconds": round((record.finished or record.started) - record.started, 1),
             "cached": sum(step.cached for step in record.stages),
             "stages": len(record.stages),

@@ -71,7 +71,13 @@ class ProgressDisplay:
     def step_finished(self, step: StepRecord, stored: StoredObject | None) -> None:
         """Print what became of the step."""
         self._drop_step()
-        mark = "[blue]cached[/]" if step.cached else _MARKS.get(step.status, step.status)
+        mark = (
+            "[blue]accepted[/]"
+            if step.accepted
+            else "[blue]cached[/]"
+            if step.cached
+            else _MARKS.get(step.status, step.status)
+        )
         seconds = "" if step.cached else f" {step.seconds:.1f} s"
         self.console.print(f"  {mark:<20} {escape(step.key)}{seconds}", soft_wrap=True)
         if step.error:

@@ -6,16 +6,26 @@ from typing import Annotated
 
 import typer
 
-from genassets.cli.run import AsJson, EngineName, Track, run_request
+from genassets.cli.run import AcceptCode, AsJson, EngineName, Track, run_request
 
 
 def resume(
     run: Annotated[str | None, typer.Argument(help="Run id or its start; the newest by default.")] = None,
+    as_saved: Annotated[
+        bool, typer.Option("--as-saved", help="Also where the experiment has been edited since.")
+    ] = False,
+    accept_code: AcceptCode = None,
     engine: EngineName = "prefect",
     as_json: AsJson = False,
     track: Track = True,
 ) -> None:
-    """Go on with a run that failed or was interrupted, with exactly its spec and its --from or --only."""
-    from genassets.cli.launch import resume_request
+    """Go on with a run that failed, crashed or was interrupted, with exactly its spec and its --from or --only.
 
-    run_request(resume_request(run, engine, track), as_json)
+    Where the experiment has been edited since, it says what differs and ends with code 2.
+    """
+    from genassets.cli.launch import resume_request
+    from genassets.pipeline.home import Home
+    from genassets.tracking.dead_runs import settle_dead_runs
+
+    settle_dead_runs(Home.from_environment())
+    run_request(resume_request(run, engine, track, tuple(accept_code or ()), as_saved), as_json)

@@ -19,6 +19,23 @@ Overrides = Annotated[
 ]
 EngineName = Annotated[str, typer.Option("--engine", help="prefect, or inline without Prefect.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON document on standard output.")]
+AcceptCode = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--accept-code",
+        metavar="STAGE",
+        help="Take what other code made of the same inputs and settings, after an edit that changes no result; "
+        "recorded. May be repeated.",
+    ),
+]
+Force = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--force",
+        metavar="STAGE",
+        help="Run this stage again; what hangs on it follows where its content changes. May be repeated.",
+    ),
+]
 Track = Annotated[bool, typer.Option("--mlflow/--no-mlflow", help="Record the run in MLflow.")]
 
 
@@ -31,6 +48,8 @@ def run(
     only: Annotated[
         str | None, typer.Option("--only", metavar="STAGE", help="Run nothing but this stage.")
     ] = None,
+    force: Force = None,
+    accept_code: AcceptCode = None,
     engine: EngineName = "prefect",
     as_json: AsJson = False,
     track: Track = True,
@@ -38,7 +57,16 @@ def run(
     """Run an experiment. What the store has already is not made again."""
     from genassets.cli.launch import RunRequest
 
-    request = RunRequest(spec, tuple(overrides or ()), start_from, only, engine, track)
+    request = RunRequest(
+        spec,
+        tuple(overrides or ()),
+        start_from,
+        only,
+        engine,
+        track,
+        force=tuple(force or ()),
+        accept_code=tuple(accept_code or ()),
+    )
     run_request(request, as_json)
 
 

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from genassets.errors import SpecError, StageError
-from genassets.pipeline.run_record import RunRecord, find_run, list_runs
+from genassets.pipeline.run_record import METRICS_FILE, RunRecord, find_run, list_runs
 
 
 def outputs_of(record: RunRecord, stage: str, advice: str) -> dict[str, Path]:
@@ -33,6 +33,16 @@ def run_of(runs: Path, name: str | None, stage: str) -> RunRecord:
         ):
             return record
     return RunRecord.load(find_run(runs, name))
+
+
+def measured_run(runs: Path, name: str) -> Path:
+    """Directory of the newest run of an experiment that has metrics, else of a run by id or its start, the newest of
+    all for "".
+    """
+    for path in reversed(list_runs(runs) if name else []):
+        if (path / METRICS_FILE).is_file() and RunRecord.load(path).experiment == name:
+            return path
+    return find_run(runs, name or None)
 
 
 @contextmanager

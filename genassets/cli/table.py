@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +22,7 @@ def table(
     as_json: AsJson = False,
 ) -> None:
     """Print sparse view, novel camera, 360 degrees and shape of some runs, with their baselines."""
+    from genassets.cli.run_outputs import measured_run
     from genassets.errors import SpecError
     from genassets.pipeline.home import Home
     from genassets.pipeline.run_record import METRICS_FILE, RunRecord, read_metrics
@@ -33,7 +33,7 @@ def table(
     home = Home.from_environment()
     rows = []
     for name in runs or [""]:
-        directories = [_find(home.runs, part) for part in name.split("+")]
+        directories = [measured_run(home.runs, part) for part in name.split("+")]
         label = RunRecord.load(directories[0]).experiment
         parts = [RunMetrics(path.name, read_metrics(path / METRICS_FILE)) for path in directories]
         rows.append((label, parts))
@@ -47,15 +47,3 @@ def table(
         typer.echo(json.dumps(document(lines), allow_nan=False))
     else:
         typer.echo(markdown_table(lines) if markdown else text_table(lines))
-
-
-def _find(runs: Path, name: str) -> Path:
-    """Directory of the newest run of an experiment that has metrics, else of a run by id or its start, the newest of
-    all for "".
-    """
-    from genassets.pipeline.run_record import METRICS_FILE, RunRecord, find_run, list_runs
-
-    for path in reversed(list_runs(runs) if name else []):
-        if (path / METRICS_FILE).is_file() and RunRecord.load(path).experiment == name:
-            return path
-    return find_run(runs, name or None)

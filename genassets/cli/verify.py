@@ -6,9 +6,12 @@ from typing import Annotated
 
 import typer
 
+from genassets.cli.run import AsJson
+
 
 def verify(
     stage: Annotated[str | None, typer.Argument(help="Only objects of this stage.")] = None,
+    as_json: AsJson = False,
 ) -> None:
     """Rehash every file of the store against its manifest."""
     from genassets.errors import SpecError
@@ -27,9 +30,14 @@ def verify(
             stored = store.read(path)
             count += 1
             problems += store.verify(stored) if stored else [f"{path}: its manifest is missing or unreadable"]
-    for problem in problems:
-        typer.echo(problem)
-    typer.echo(f"{count} objects, {len(problems)} problems")
+    if as_json:
+        import json
+
+        typer.echo(json.dumps({"objects": count, "problems": problems}))
+    else:
+        for problem in problems:
+            typer.echo(problem)
+        typer.echo(f"{count} objects, {len(problems)} problems")
     if problems:
         typer.echo("remove a damaged object's directory and run again: the stage makes it anew", err=True)
         raise typer.Exit(3)

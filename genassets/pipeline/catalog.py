@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 
 from pydantic import BaseModel
 
@@ -35,9 +35,9 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_reconstruction.STAGE,
     evaluate_turns.STAGE,
     turntables.STAGE,
-    export.STAGE,
     train_prior.STAGE,
     generate.STAGE,
+    export.STAGE,
     evaluate_generation.STAGE,
     evaluate_sampling.STAGE,
     evaluate_completion.STAGE,
@@ -53,8 +53,13 @@ def configs(catalog: Iterable[Stage]) -> dict[str, type[BaseModel]]:
     return {stage.name: stage.config for stage in catalog}
 
 
-def wanted_stages(catalog: Iterable[Stage], names: Iterable[str] | None) -> tuple[Stage, ...]:
-    """The named stages and all that they need, in the catalog's order; for None all that don't wait to be named."""
+def wanted_stages(
+    catalog: Iterable[Stage], names: Iterable[str] | None, planned: Collection[str] = ()
+) -> tuple[Stage, ...]:
+    """The named stages and all that they need, in the catalog's order; for None all that don't wait to be named.
+
+    Of what they use only stages in ``planned`` come along.
+    """
     ordered = tuple(catalog)
     by_name: Mapping[str, Stage] = {stage.name: stage for stage in ordered}
     if names is None:
@@ -66,6 +71,7 @@ def wanted_stages(catalog: Iterable[Stage], names: Iterable[str] | None) -> tupl
         if name not in wanted:
             wanted.add(name)
             waiting.extend(by_name[name].needs)
+            waiting.extend(used for used in by_name[name].uses if used in planned)
     return tuple(stage for stage in ordered if stage.name in wanted)
 
 
@@ -73,6 +79,6 @@ def dependents(stages: Iterable[Stage], name: str) -> set[str]:
     """A stage and all that hang on it, directly or not."""
     found = {name}
     for stage in stages:  # in order, so one pass is enough
-        if found.intersection(stage.needs):
+        if found.intersection((*stage.needs, *stage.uses)):
             found.add(stage.name)
     return found

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from genassets.errors import CodeChanged, GenAssetsError, StageError
 from genassets.pipeline.fingerprint import fingerprint
-from genassets.pipeline.plan import Step, Workflow
+from genassets.pipeline.plan import Step, Workflow, code_twin, reason_to_make, reason_to_run
 from genassets.pipeline.run_record import METRICS_FILE, RunRecord, StepRecord, read_metrics, write_metrics
 from genassets.pipeline.store import CURVES, METRICS, StoredObject
 from genassets.stages.stage import Inputs, Metric, StageContext
@@ -56,16 +56,30 @@ def run_inline(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome])
     return work()
 
 
+def wanted_tree(
+    workflow: Workflow, step: Step, inputs: Mapping[str, Mapping[str, StoredObject]]
+) -> dict[str, Any]:
+    """The component tree of the object that a step wants, given the objects that it reads by stage and shard."""
+    contents = {
+        stage: {s: stored.content for s, stored in shards.items()} for stage, shards in inputs.items()
+    }
+    return workflow.tree(step, contents)
+
+
 def perform(
     workflow: Workflow,
     step: Step,
+    tree: Mapping[str, Any],
     inputs: Mapping[str, Mapping[str, StoredObject]],
     on_progress: Callable[[float, float, str], None],
+    on_reason: Callable[[str], None],
 ) -> Outcome:
     """Find a step's object in the store or make it.
 
     Args:
+        tree: as by ``wanted_tree``.
         inputs: the objects that the step reads, by stage and shard.
+        on_reason: told why the object has to be made before that begins.
 
     Raises:
         CodeChanged: the stage's source is no longer what the fingerprint says; nothing is stored.
@@ -73,10 +87,6 @@ def perform(
     """
     store = workflow.store
     name = step.stage.name
-    contents = {
-        stage: {s: stored.content for s, stored in shards.items()} for stage, shards in inputs.items()
-    }
-    tree = workflow.tree(step, contents)
     digest = fingerprint(tree)
     found = store.find(name, digest)
     if found is not None and not step.forced:
@@ -86,6 +96,9 @@ def perform(
         if found is not None and not step.forced:
             return Outcome(found, cached=True)
         workflow.check_code(step)
+        if found is None and name in workflow.selection.accept_code:
+            return Outcome(_accepted(workflow, step, tree), cached=True)
+        on_reason(reason_to_make(store, step, tree, found is not None))
         if step.forced and step.key not in workflow.selection.begun:
             store.clear_work(name, digest)
         with store.creating(name, digest) as out:
@@ -114,6 +127,20 @@ def perform(
             made = store.commit(out, name, step.shard, digest, tree, seconds, step.stage.location_files)
         store.clear_work(name, digest)
     return Outcome(made, cached=False)
+
+
+def _accepted(workflow: Workflow, step: Step, tree: Mapping[str, Any]) -> StoredObject:
+    """What other code made of the same inputs and settings, put under the step's own fingerprint."""
+    twin = code_twin(workflow.store, tree)
+    if twin is None:
+        raise StageError(
+            f"--accept-code {step.stage.name}: of {step.key} the store has nothing that differs by code alone "
+            f"({reason_to_run(workflow.store, tree)}); run without it"
+        )
+    stored, changed = twin
+    modules = [field.removeprefix("code/") for field, _, _ in changed]
+    log.warning("%s: %s taken though its code changed: %s", step.key, stored.path, ", ".join(modules))
+    return workflow.store.adopt(stored, fingerprint(tree), tree, step.stage.location_files, modules)
 
 
 class _Curves:
@@ -202,7 +229,6 @@ class _Run:
         """Run one step and record what became of it."""
         record = self._record.step(step.key)
         inputs, missing = self._inputs(step)
-        selection = self._workflow.selection
         if missing:
             record.status = "skipped"
             record.error = f"needs {', '.join(missing)}"
@@ -217,10 +243,17 @@ class _Run:
             for listener in self._listeners:
                 listener.step_progress(record, done, total, message)
 
+        def on_reason(reason: str) -> None:
+            record.reason = reason
+            self._record.save()
+
         def work() -> Outcome:
-            if selection.only is not None and step.stage.name != selection.only:
-                return self._from_store(step, inputs)
-            return perform(self._workflow, step, inputs, on_progress)
+            tree = wanted_tree(self._workflow, step, inputs)
+            record.fingerprint = fingerprint(tree)
+            self._record.save()  # before the object is looked for: what a run is at is not collected
+            if self._workflow.selection.leaves_alone(step):
+                return self._from_store(step, record.fingerprint)
+            return perform(self._workflow, step, tree, inputs, on_progress, on_reason)
 
         started = time.monotonic()
         fingerprints = {
@@ -247,18 +280,19 @@ class _Run:
             return
         record.status = "completed"
         record.cached = outcome.cached
-        record.fingerprint = outcome.stored.fingerprint
+        record.accepted = (outcome.stored.accepted or {}).get("fingerprint")
         record.path = str(outcome.stored.path)
         record.seconds = 0.0 if outcome.cached else outcome.stored.seconds
         self._done[step.key] = outcome.stored
         self._finished(record, outcome.stored)
 
-    def _from_store(self, step: Step, inputs: Mapping[str, Mapping[str, StoredObject]]) -> Outcome:
-        """The object of a step that --only leaves alone."""
-        contents = {
-            stage: {s: stored.content for s, stored in shards.items()} for stage, shards in inputs.items()
-        }
-        found = self._workflow.store.find(step.stage.name, fingerprint(self._workflow.tree(step, contents)))
+    def _from_store(self, step: Step, digest: str) -> Outcome:
+        """The object of a step that --only or a retry leaves alone."""
+        found = self._workflow.store.find(step.stage.name, digest)
+        if found is None and self._workflow.selection.retry:
+            raise StageError(
+                f"{step.key}, which the retried steps may need, is not in the store; make everything: genassets resume"
+            )
         if found is None:
             raise StageError(
                 f"--only {self._workflow.selection.only}: what it needs, {step.key}, is not in the store; run "

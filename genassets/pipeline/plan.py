@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,15 +31,26 @@ _CODE_OF_PROCESS: dict[CodeRoots, dict[str, str]] = {}
 class Selection:
     """Which stages have to run again, or alone.
 
-    ``start_from``: that stage and what hangs on it run even where the store has them. ``only``: nothing but
-    that stage; what it needs has to be in the store. Of a run that is resumed, ``made`` are the keys of the
-    steps that it completed, which need not be made again, and ``begun`` those whose checkpoints are its own.
+    ``start_from``: that stage and what hangs on it run even where the store has them. ``force``: so do these stages;
+    what hangs on them follows where their content changes. ``only``: nothing but that stage; what it needs has to be
+    in the store. ``retry``: likewise nothing but the steps of these keys, which failed. ``accept_code``: stages whose
+    stored objects serve although other code made them. Of a run that is resumed, ``made`` are the keys of the steps
+    that it completed, which need not be made again, and ``begun`` those whose checkpoints are its own.
     """
 
     start_from: str | None = None
     only: str | None = None
+    force: tuple[str, ...] = ()
+    accept_code: tuple[str, ...] = ()
+    retry: frozenset[str] = frozenset()
     made: frozenset[str] = frozenset()
     begun: frozenset[str] = frozenset()
+
+    def leaves_alone(self, step: Step) -> bool:
+        """Whether a step may be looked up in the store alone, not made."""
+        if self.retry:
+            return step.key not in self.retry
+        return self.only is not None and step.stage.name != self.only
 
 
 @dataclass(frozen=True)
@@ -63,11 +74,13 @@ class PlannedStep:
     """
 
     step: Step
-    action: str  # "cached" or "run"
+    action: str  # "cached", "accept" (made by other code), "run", or "refuse" where --accept-code finds none
     reason: str
     tree: Mapping[str, Any] | None
     fingerprint: str | None
     path: Path | None
+    replaces: bool = False
+    """Whether the store has an object at ``path`` that will give way to the new one."""
 
 
 class Workflow:
@@ -85,20 +98,40 @@ class Workflow:
         self._borrowed: dict[Borrowed, tuple[Path, str]] = {}
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
+        selection = self.selection
         names = [stage.name for stage in catalog]
-        for option, chosen in (("--from", self.selection.start_from), ("--only", self.selection.only)):
+        again = [("--from", selection.start_from), *(("--force", name) for name in selection.force)]
+        accepted = [("--accept-code", name) for name in selection.accept_code]
+        for option, chosen in (("--only", selection.only), *again, *accepted):
             if chosen is not None and chosen not in names:
                 raise SpecError(f"{option} {chosen}: no such stage; stages are {', '.join(names)}")
         wanted = self.experiment.header.stages
-        if self.selection.only is not None:
-            return wanted_stages(catalog, [self.selection.only])
         stages = wanted_stages(catalog, wanted)
-        chosen = self.selection.start_from
-        if chosen is not None and chosen not in {stage.name for stage in stages}:
+        alone = {key.partition("[")[0] for key in selection.retry} or {*filter(None, [selection.only])}
+        if alone:
+            # With what they use of this experiment's, so that their fingerprints are those of the whole run.
+            stages = wanted_stages(catalog, alone, {stage.name for stage in stages})
+        here = {stage.name for stage in stages}
+        for option, chosen in (*again, *accepted):
+            if chosen is not None and chosen not in here and not selection.retry:
+                raise SpecError(
+                    f"{option} {chosen}: the experiment does not want this stage (stages: {list(wanted or ())})"
+                )
+        both = sorted(self._forced(stages).intersection(selection.accept_code))
+        if both and not selection.retry:
             raise SpecError(
-                f"--from {chosen}: the experiment does not want this stage (stages: {list(wanted or ())})"
+                f"--accept-code {both[0]}: --from, --force or --only asks to make {both[0]} again; give one of them"
             )
         return stages
+
+    def _forced(self, stages: tuple[Stage, ...]) -> set[str]:
+        """Stages that run even where the store has them."""
+        if self.selection.only is not None:
+            return {self.selection.only}
+        forced = set(self.selection.force)
+        if self.selection.start_from is not None:
+            forced |= dependents(stages, self.selection.start_from)
+        return forced
 
     @property
     def shards(self) -> tuple[str, ...]:
@@ -107,11 +140,7 @@ class Workflow:
 
     def steps(self) -> list[Step]:
         """Every stage and shard, in an order in which each comes after what it needs."""
-        forced: set[str] = set()
-        if self.selection.start_from is not None:
-            forced = dependents(self.stages, self.selection.start_from)
-        if self.selection.only is not None:
-            forced = {self.selection.only}
+        forced = self._forced(self.stages)
         steps = [
             Step(stage, shard, stage.name in forced)
             for stage in self.stages
@@ -123,7 +152,7 @@ class Workflow:
         """Keys of the steps that a step reads, by stage and shard ("" for a stage without shards)."""
         by_name = {stage.name: stage for stage in self.stages}
         needed: dict[str, dict[str, str]] = {}
-        for name in step.stage.needs:
+        for name in (*step.stage.needs, *(used for used in step.stage.uses if used in by_name)):
             stage = by_name[name]
             if not stage.sharded:
                 needed[name] = {"": name}
@@ -229,7 +258,7 @@ class Workflow:
 
 
 def make_plan(workflow: Workflow) -> list[PlannedStep]:
-    """For every step whether the store has it, and if not, why it would run."""
+    """For every step whether the store has it, and if not, why it would run. Nothing is made or written."""
     store = workflow.store
     done: dict[str, StoredObject] = {}
     planned: list[PlannedStep] = []
@@ -252,13 +281,39 @@ def make_plan(workflow: Workflow) -> list[PlannedStep]:
         if stored is not None and not step.forced:
             done[step.key] = stored
             planned.append(PlannedStep(step, "cached", "the store has it", tree, digest, path))
-        elif stored is not None:
-            planned.append(
-                PlannedStep(step, "run", "asked for again by --from or --only", tree, digest, path)
-            )
+        elif stored is None and step.stage.name in workflow.selection.accept_code:
+            twin = code_twin(store, tree)
+            if twin is None:
+                reason = f"--accept-code: more than code differs: {reason_to_run(store, tree)}"
+                planned.append(PlannedStep(step, "refuse", reason, tree, digest, path))
+            else:
+                done[step.key] = twin[0]
+                reason = f"taken as it is, though {_in_words(twin[1])}"
+                planned.append(PlannedStep(step, "accept", reason, tree, digest, path))
         else:
-            planned.append(PlannedStep(step, "run", reason_to_run(store, tree), tree, digest, path))
+            reason = reason_to_make(store, step, tree, stored is not None)
+            planned.append(PlannedStep(step, "run", reason, tree, digest, path, path.exists()))
     return planned
+
+
+def reason_to_make(store: Store, step: Step, tree: Mapping[str, Any], is_stored: bool) -> str:
+    """One line that says why a step is made; ``is_stored``: although the store has it."""
+    if is_stored:
+        return "asked for again by --from, --force or --only"
+    return reason_to_run(store, tree)
+
+
+def code_twin(
+    store: Store, tree: Mapping[str, Any]
+) -> tuple[StoredObject, list[tuple[str, Any, Any]]] | None:
+    """The newest whole object that differs from a component tree by its code alone, and how."""
+    for stored in reversed(store.all_of(str(tree["stage"]))):
+        changed = list(differences(stored.components, tree))
+        if changed and all(name.startswith("code/") for name, _, _ in changed):
+            whole = store.find(stored.stage, stored.fingerprint)
+            if whole is not None:
+                return whole, changed
+    return None
 
 
 def nearest_stored(
@@ -283,8 +338,12 @@ def reason_to_run(store: Store, tree: Mapping[str, Any]) -> str:
     changed = nearest[1]
     if not changed:
         return "its stored object is incomplete"
+    return f"changed: {_in_words(changed)}"
+
+
+def _in_words(changed: Sequence[tuple[str, Any, Any]]) -> str:
     shown = ", ".join(describe_difference(*change) for change in changed[:2])
-    return f"changed: {shown}" + (f" and {len(changed) - 2} more" if len(changed) > 2 else "")
+    return shown + (f" and {len(changed) - 2} more" if len(changed) > 2 else "")
 
 
 def describe_difference(name: str, before: Any, after: Any) -> str:
@@ -294,9 +353,10 @@ def describe_difference(name: str, before: Any, after: Any) -> str:
         return f"code {name.removeprefix('code/')} {verb}"
     if name.startswith(("inputs/", "sources/")):
         return f"{name} has other content"
-    return f"{name} {_short(before)} -> {_short(after)}"
+    return f"{name} {describe_value(before)} -> {describe_value(after)}"
 
 
-def _short(value: Any) -> str:
+def describe_value(value: Any) -> str:
+    """A setting's value in words, cut short."""
     text = "absent" if value is None else str(value)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import socket
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -14,20 +12,26 @@ from typing import Any
 
 import yaml
 
-from genassets.errors import SpecError
+from genassets.errors import SpecError, StageError
 from genassets.pipeline.atomic_write import write_json, write_text
+from genassets.pipeline.heartbeat import is_silent, last_sign
+from genassets.pipeline.process_mark import ProcessMark
 
 RUN_FILE = "run.json"
 SPEC_FILE = "spec.yaml"
 METRICS_FILE = "metrics.parquet"
 METRIC_COLUMNS = ("stage", "setting", "split", "class", "metric", "value", "n", "method")
-# Statuses of a run: running, completed, partly_failed, failed, interrupted; of a step: pending, running,
-# completed, failed, skipped (something it needs failed), interrupted.
+# Statuses of a run: running, completed, partly_failed, failed, interrupted, crashed; of a step: pending, running,
+# completed, failed, skipped (something it needs failed), interrupted, crashed.
 
 
 @dataclass
 class StepRecord:
-    """What became of one stage or shard; ``name`` is the stage's."""
+    """What became of one stage or shard; ``name`` is the stage's.
+
+    ``reason`` says why it was made, None where it was not; ``accepted`` is the fingerprint of an object that other
+    code made and that was taken at the user's word.
+    """
 
     name: str
     shard: str | None
@@ -37,6 +41,8 @@ class StepRecord:
     seconds: float = 0.0
     path: str | None = None
     error: str | None = None
+    reason: str | None = None
+    accepted: str | None = None
 
     @property
     def key(self) -> str:
@@ -46,7 +52,11 @@ class StepRecord:
 
 @dataclass
 class RunRecord:
-    """What became of a run; ``save`` after each change, so that run.json is true at any moment."""
+    """What became of a run; ``save`` after each change, so that run.json is true at any moment.
+
+    ``source`` and ``overrides`` are what the spec was made from, ``spec`` is the resolved spec as plain values (that of
+    spec.yaml, unless someone edits it); ``retries`` is the run whose failed steps this one tries again.
+    """
 
     run_id: str
     directory: Path
@@ -57,14 +67,19 @@ class RunRecord:
     stages: list[StepRecord]
     status: str = "running"
     exit_code: int | None = None
-    pid: int = field(default_factory=os.getpid)
-    host: str = field(default_factory=socket.gethostname)
+    process: ProcessMark = field(default_factory=ProcessMark.current)
     finished: float | None = None
     error: str | None = None
     report: str | None = None
     mlflow_run_id: str | None = None
     start_from: str | None = None
     only: str | None = None
+    force: tuple[str, ...] = ()
+    accept_code: tuple[str, ...] = ()
+    retries: str | None = None
+    source: str | None = None
+    overrides: tuple[str, ...] = ()
+    spec: dict[str, Any] | None = None
 
     def step(self, key: str) -> StepRecord:
         """The record of a step by its key."""
@@ -78,24 +93,44 @@ class RunRecord:
 
     @classmethod
     def load(cls, directory: Path) -> RunRecord:
-        """Read run.json of a run's directory."""
-        values = json.loads((directory / RUN_FILE).read_text(encoding="utf-8"))
-        values["directory"] = directory
-        values["stages"] = [StepRecord(**step) for step in values["stages"]]
-        return cls(**values)
+        """Read run.json of a run's directory.
+
+        Raises:
+            StageError: it is damaged.
+        """
+        file = directory / RUN_FILE
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+            if "pid" in values:  # records of before the mark had these two alone
+                values["process"] = {"host": values.pop("host"), "pid": values.pop("pid")}
+            values["process"] = ProcessMark(**values["process"])
+            values["directory"] = directory
+            values["stages"] = [StepRecord(**step) for step in values["stages"]]
+            for name in ("force", "accept_code", "overrides"):
+                values[name] = tuple(values.get(name, ()))
+            return cls(**values)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise StageError(
+                f"{file}: not the record of a run ({type(error).__name__}: {error}); move {directory} away"
+            ) from error
 
     @property
     def is_dead(self) -> bool:
-        """Whether it says running but its process on this machine is gone."""
-        if self.status != "running" or self.host != socket.gethostname():
+        """Whether it says running but its process is gone: ended here, or silent for long on another host."""
+        if self.status != "running":
             return False
-        try:
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return True
-        except PermissionError:
-            return False
-        return False
+        gone = self.process.is_gone()
+        return is_silent(self.directory) if gone is None else gone
+
+    def set_crashed(self) -> None:
+        """Say of a dead run that it crashed, when it was last seen, and which steps it was at."""
+        for step in self.stages:
+            if step.status == "running":
+                step.status = "crashed"
+        self.status = "crashed"
+        process = f"process {self.process.pid} on {self.process.host}"
+        self.error = f"{process} ended without a word; go on with: genassets resume"
+        self.finished = last_sign(self.directory) or (self.directory / RUN_FILE).stat().st_mtime
 
 
 def new_run_directory(runs: Path, experiment: str) -> Path:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genassets.errors import EnvironmentProblem, LockedError
+from genassets.errors import EnvironmentProblem, LockedError, StageError
 from genassets.pipeline.atomic_write import sync_directory
 from genassets.pipeline.file_digests import sha256_of
 
@@ -27,12 +27,18 @@ CURVES = "curves.parquet"
 PICTURES = "pictures"
 # Files for people and reports; no later stage reads them, and timings among them differ from run to run.
 OUTSIDE_CONTENT = (METRICS, CURVES, PICTURES + ".json", PICTURES + "/")
+PARTIAL_PREFIXES = (".tmp-", ".old-")
+"""Directories beside objects that are not whole yet, or have been replaced."""
 DEFAULT_LOCK_SECONDS = 6 * 3600.0
 
 
 @dataclass(frozen=True)
 class StoredObject:
-    """A complete object: where it lies, the digest of what later stages read, and how it came to be."""
+    """A complete object: where it lies, the digest of what later stages read, and how it came to be.
+
+    ``accepted``: the fingerprint of the object whose files these are, and the modules that have changed since it was
+    made; None for an object that its own code made.
+    """
 
     stage: str
     shard: str | None
@@ -42,6 +48,7 @@ class StoredObject:
     components: Mapping[str, Any]
     seconds: float
     files: Mapping[str, Mapping[str, Any]]
+    accepted: Mapping[str, Any] | None = None
 
     @property
     def size(self) -> int:
@@ -101,6 +108,41 @@ class Store:
                 problems.append(f"{path}: not in the manifest")
         return problems
 
+    def works(self) -> list[tuple[str, str, Path]]:
+        """Stage, fingerprint and directory of all checkpoints."""
+        folder = self.root / "work"
+        found = sorted(folder.iterdir()) if folder.is_dir() else []
+        named = [(path.name.rpartition("-"), path) for path in found if path.is_dir()]
+        return [(stage, digest, path) for (stage, _, digest), path in named]
+
+    def partials(self) -> list[tuple[str, str, Path]]:
+        """Stage, fingerprint and directory of what was being written or replaced when its process died, or still is."""
+        return [
+            (stage, path.name.split("-")[1], path)
+            for stage in self.stages()
+            for path in sorted((self.root / "objects" / stage).iterdir())
+            if path.name.startswith(PARTIAL_PREFIXES)
+        ]
+
+    def is_locked(self, stage: str, fingerprint: str) -> bool:
+        """Whether a process holds an object's lock now."""
+        if not self._lock_file(stage, fingerprint).is_file():
+            return False
+        try:
+            with self.lock(stage, fingerprint, wait_seconds=0):
+                return False
+        except LockedError:
+            return True
+
+    def remove(self, path: Path) -> None:
+        """Remove an object, checkpoints or a partial directory; the caller holds its lock. An object goes at once."""
+        with _disk_errors_named(self.root):
+            if path == self.path_of(path.parent.name, path.name) and not path.name.startswith(
+                PARTIAL_PREFIXES
+            ):
+                path = path.rename(path.with_name(f".old-{path.name}-{os.getpid()}"))
+            shutil.rmtree(path)
+
     def work_dir(self, stage: str, fingerprint: str) -> Path:
         """Directory for checkpoints of an unfinished object; it survives a kill."""
         path = self.root / "work" / f"{stage}-{fingerprint}"
@@ -122,7 +164,7 @@ class Store:
         """
         from filelock import FileLock, Timeout  # plan and status take no lock
 
-        path = self.root / "locks" / f"{stage}-{fingerprint}.lock"
+        path = self._lock_file(stage, fingerprint)
         with _disk_errors_named(self.root):
             path.parent.mkdir(parents=True, exist_ok=True)
         try:
@@ -133,6 +175,9 @@ class Store:
                 f"{path}: another process is making this object of {stage} and did not finish within "
                 f"{wait_seconds:g} s; wait for it, or end that process"
             ) from error
+
+    def _lock_file(self, stage: str, fingerprint: str) -> Path:
+        return self.root / "locks" / f"{stage}-{fingerprint}.lock"
 
     @contextmanager
     def creating(self, stage: str, fingerprint: str) -> Iterator[Path]:
@@ -161,6 +206,7 @@ class Store:
         components: Mapping[str, Any],
         seconds: float,
         location_files: Collection[str] = (),
+        accepted: Mapping[str, Any] | None = None,
     ) -> StoredObject:
         """Write the manifest, sync, and rename the temporary directory into place.
 
@@ -185,6 +231,7 @@ class Store:
                 "seconds": seconds,
                 "files": files,
                 "components": components,
+                "accepted": accepted,
             }
             target = temporary / MANIFEST
             target.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n", encoding="utf-8")
@@ -200,6 +247,44 @@ class Store:
         assert stored is not None
         return stored
 
+    def adopt(
+        self,
+        stored: StoredObject,
+        fingerprint: str,
+        components: Mapping[str, Any],
+        location_files: Collection[str],
+        changed: Collection[str],
+    ) -> StoredObject:
+        """Let an object serve under another fingerprint as well; the caller holds that one's lock.
+
+        Files are linked where the file system can, for nobody writes into an object. ``changed`` names the modules
+        whose edits were said to have no effect.
+
+        Raises:
+            StageError: the object is damaged.
+        """
+        if problems := self.verify(stored):
+            raise StageError(f"{stored.path} cannot be accepted, it is damaged: {problems[0]}")
+        accepted = {"fingerprint": stored.fingerprint, "code": sorted(changed)}
+        with self.creating(stored.stage, fingerprint) as out:
+            for name in stored.files:
+                target = out / name
+                target.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    target.hardlink_to(stored.path / name)
+                except OSError:
+                    shutil.copyfile(stored.path / name, target)
+            return self.commit(
+                out,
+                stored.stage,
+                stored.shard,
+                fingerprint,
+                components,
+                stored.seconds,
+                location_files,
+                accepted,
+            )
+
     def directories(self, stage: str) -> list[Path]:
         """Directories of a stage's objects, oldest first, whether complete or not."""
         folder = self.root / "objects" / stage
@@ -210,7 +295,7 @@ class Store:
 
     @staticmethod
     def _sweep(parent: Path, fingerprint: str) -> None:
-        for prefix in (".tmp-", ".old-"):
+        for prefix in PARTIAL_PREFIXES:
             for path in parent.glob(f"{prefix}{fingerprint}-*"):
                 shutil.rmtree(path, ignore_errors=True)
 
@@ -236,6 +321,7 @@ def _read_manifest(path: Path) -> StoredObject | None:
             components=manifest["components"],
             seconds=float(manifest["seconds"]),
             files=manifest["files"],
+            accepted=manifest.get("accepted"),
         )
     except (OSError, ValueError, KeyError, TypeError):
         return None

@@ -327,6 +327,7 @@ STAGE = Stage(
     version=1,
     config=ExportConfig,
     needs=("ingest", "filter_occlusion", "reconstruct", "evaluate_reconstruction"),
+    uses=("generate",),
     modules=(
         "genassets.export",
         "genassets.curation",

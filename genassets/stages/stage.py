@@ -97,7 +97,7 @@ class Inputs:
 
     def _of(self, stage: str) -> Mapping[str, Path]:
         if stage not in self.objects:
-            raise KeyError(f"stage {stage!r} is not among the declared needs {sorted(self.objects)}")
+            raise KeyError(f"stage {stage!r} is not among the inputs {sorted(self.objects)}")
         return self.objects[stage]
 
 
@@ -151,6 +151,7 @@ class Stage:
     Attributes:
         version: raised when the meaning or format of the output changes without a change of code.
         needs: stages whose outputs are read. A sharded stage that needs a sharded stage reads its own shard.
+        uses: stages whose outputs are read as well where the run makes them, and done without where it does not.
         modules: packages and modules of genassets whose code decides the result, by dotted name
             ("genassets.masks"); the stage's own module is always included.
         code_when: modules that decide the result with some configs alone, each with the test of a config. With the
@@ -176,6 +177,7 @@ class Stage:
     run: Callable[[Inputs, Any, Path, StageContext], list[Metric]]
     sharded: bool
     summary: str
+    uses: tuple[str, ...] = ()
     code_when: Mapping[str, Callable[[Any], bool]] = field(default_factory=dict)
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()

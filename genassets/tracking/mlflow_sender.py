@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 BATCH = 1000  # most metrics that log_batch takes at once
 PARAM_BATCH = 100
-_STATUS = {"completed": "FINISHED", "partly_failed": "FINISHED", "interrupted": "KILLED"}
+_STATUS = {"completed": "FINISHED", "partly_failed": "FINISHED", "interrupted": "KILLED", "crashed": "KILLED"}
 
 
 class MlflowSender:

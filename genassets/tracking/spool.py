@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from genassets.pipeline.atomic_write import write_json
 
@@ -37,8 +37,16 @@ class Spool:
     def append(self, event: dict[str, Any]) -> None:
         """Add an event at the end."""
         self.folder.mkdir(parents=True, exist_ok=True)
-        with self._events.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(event) + "\n")
+        with self._events.open("ab") as file:
+            if file.tell() > 0:
+                self._drop_partial_line(file)
+            file.write(json.dumps(event).encode() + b"\n")
+
+    def _drop_partial_line(self, file: BinaryIO) -> None:
+        """Cut off what a killed process left of a line; it would swallow the next."""
+        text = self._events.read_bytes()
+        if not text.endswith(b"\n"):
+            file.truncate(text.rfind(b"\n") + 1)
 
     def events(self) -> list[dict[str, Any]]:
         """All whole events; a line that a killed process left unfinished ends the list."""
