@@ -148,9 +148,10 @@ def toy_workflow(
 def start_record(workflow: Workflow) -> RunRecord:
     """A record with a run directory, as the command makes it."""
     directory = new_run_directory(workflow.home.runs, "toy")
-    save_spec(directory, workflow.experiment.resolved())
+    resolved = workflow.experiment.resolved()
+    save_spec(directory, resolved)
     steps = [StepRecord(step.stage.name, step.shard) for step in workflow.steps()]
-    return RunRecord(directory.name, directory, "toy", "test", "inline", time.time(), steps)
+    return RunRecord(directory.name, directory, "toy", "test", "inline", time.time(), steps, spec=resolved)
 
 
 def run_toy(

@@ -99,7 +99,7 @@ def _explain_step(store: Store, step: StepRecord) -> Explanation:
     if step.accepted is not None:
         modules = ", ".join((stored.accepted or {}).get("code", [])) if stored is not None else "its code"
         return Explanation(
-            step.key, "accepted", f"what {step.accepted[:12]} is was taken, though {modules} changed", path
+            step.key, "accepted", f"object {step.accepted[:12]} serves, though {modules} changed", path
         )
     if step.cached:
         return Explanation(step.key, "cached", "the store had it", path)

@@ -50,7 +50,7 @@ class Reached:
 
 
 def reached_by(runs: Iterable[Path]) -> Reached:
-    """What the runs of some directories hold on to.
+    """What the runs of some directories, oldest first, hold on to.
 
     Raises:
         StageError: a record is damaged, so that nobody knows what it reaches.
@@ -69,6 +69,10 @@ def reached_by(runs: Iterable[Path]) -> Reached:
         for step in record.stages:
             if step.fingerprint is not None:
                 objects.add((step.name, step.fingerprint))
+            if step.status == "completed":
+                work.discard(
+                    (step.name, step.fingerprint or "")
+                )  # a later run has made what this one left unfinished
             if step.status in UNFINISHED:
                 work.add((step.name, step.fingerprint or ""))
                 if step.fingerprint is None:
