@@ -1,4 +1,4 @@
-"""What a person may choose to run again, or to leave as it is: retry, --force, --accept-code, resume of an edited spec."""
+"""What a person may choose to run again or to leave: retry, --force, --accept-code, resume of an edited spec."""
 
 from __future__ import annotations
 

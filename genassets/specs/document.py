@@ -39,6 +39,7 @@ class Document:
         """This document laid over ``base``: mappings merge key by key, anything else replaces."""
         origins = dict(base.origins)
         values = _merge(base.values, self.values, (), origins, self.origins)
+        origins.update({at: origin for at, origin in self.origins.items() if at == ()})
         return Document(values, origins)
 
     def nested(self, *path: str) -> Document:

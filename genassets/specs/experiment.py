@@ -116,10 +116,12 @@ def build_experiment(
     profile = _profile(top, configs, data_specs)
     top = top.merged_over(profile) if profile is not None else top
     if isinstance(top.values.get("dataset"), str):
-        dataset = read_document(_display(find_spec("datasets", top.values["dataset"], data_specs))).nested(
-            "dataset"
-        )
-        top = dataset.merged_over(top.without("dataset"))
+        name = top.values["dataset"]
+        try:
+            path = _display(find_spec("datasets", name, data_specs))
+        except SpecError as error:
+            raise SpecError(f"{top.origin(('dataset',))}: dataset is {name!r}: {error}") from error
+        top = read_document(path).nested("dataset").merged_over(top.without("dataset"))
     for override in given:
         top = top if override in chosen else override.merged_over(top)
     return _validated(top, configs)
