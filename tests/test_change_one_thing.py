@@ -126,7 +126,7 @@ def other_values(value: Any, words: list[str], made: Made) -> list[Any]:
 
 def changed_section(made: Made, stage: str, at: At) -> dict[str, Any] | None:
     """The stage's section with another valid value at a key path; None where none was found."""
-    section = made.experiment.sections[stage]
+    section = dict(made.experiment.sections[stage])
     words: list[str] = []
     try:
         _validated(made, stage, with_value(section, at, "?"))
@@ -231,8 +231,9 @@ def imported(file: Path) -> set[str]:
     return found
 
 
-def closure(begin: Iterator[str] | list[str], end: set[str], imports: Mapping[str, set[str]]) -> set[str]:
-    waiting, found = list(begin), set()
+def closure(begin: list[str], end: set[str], imports: Mapping[str, set[str]]) -> set[str]:
+    waiting = list(begin)
+    found: set[str] = set()
     while waiting:
         name = waiting.pop()
         if name in imports and name not in found | end | WITHOUT_EFFECT:

@@ -95,7 +95,7 @@ def test_other_commands_as_json(home: Path) -> None:
         ("run", False),
     ], "report waits for what total gives"
     assert "nothing is overwritten" in answer("plan", spec, "--set", "total.scale=9")
-    assert one.step("total").path in answer("plan", spec, "--force", "total").splitlines()[-1]
+    assert str(one.step("total").path) in answer("plan", spec, "--force", "total").splitlines()[-1]
     pictured = json.loads(answer("flow", spec, "--json"))
     assert [(stage["name"], stage["logs"], stage["cached"]) for stage in pictured["stages"]] == [
         ("numbers", 2, 2),

@@ -26,8 +26,16 @@ def plan(
     from genassets.pipeline.history import History
     from genassets.pipeline.plan import make_plan
 
-    again = {"force": tuple(force or ()), "accept_code": tuple(accept_code or ())}
-    workflow = load_workflow(RunRequest(spec, tuple(overrides or ()), start_from, only, **again))
+    workflow = load_workflow(
+        RunRequest(
+            spec,
+            tuple(overrides or ()),
+            start_from,
+            only,
+            force=tuple(force or ()),
+            accept_code=tuple(accept_code or ()),
+        )
+    )
     planned = make_plan(workflow)
     history = History(workflow.store)
     seconds = [history.expected_seconds(workflow, item) for item in planned]
