@@ -83,6 +83,7 @@ def kill_at_random(home: Path, kills: int, seed: int) -> None:
     """Kill runs at random moments, one new store each, and start the same again: it ends as if undisturbed."""
     stages = [laborious(stage, home / "tally") for stage in TOYS]
     home.mkdir()
+    run_toy(home / "first", stages=stages)  # imports what runs import late, so that children have it
     started = time.monotonic()
     code, _ = run_toy(home / "undisturbed", stages=stages)
     whole = time.monotonic() - started
@@ -90,7 +91,9 @@ def kill_at_random(home: Path, kills: int, seed: int) -> None:
     expected = digests(home / "undisturbed")
     draw = random.Random(seed)
     landed = 0
-    for number in range(kills):
+    for number in range(10 * kills):
+        if landed == kills:
+            return
         place = home / str(number)
         pid = in_a_child(lambda place=place: run_toy(place, stages=stages)[0])  # type: ignore[misc]
         time.sleep(draw.uniform(0, whole))
@@ -112,7 +115,7 @@ def kill_at_random(home: Path, kills: int, seed: int) -> None:
         assert {item.path for item in garbage} == set((place / "store/work").iterdir())
         assert len(list(collect(Home(place), garbage))) == len(garbage)
         assert digests(place) == expected
-    assert landed >= kills // 3, f"only {landed} of {kills} kills met a run that still went on"
+    pytest.fail(f"only {landed} of {10 * kills} kills met a run that still went on")
 
 
 def test_killed_runs_end_as_if_undisturbed(tmp_path: Path) -> None:
