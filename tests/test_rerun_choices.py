@@ -229,6 +229,8 @@ def test_a_run_explains_later_why_its_stages_ran(tmp_path: Path) -> None:
     assert (found.action, found.reason) == ("ran", "changed: config/scale 1.0 -> 2.0")
     assert found.changes == (("config/scale", 1.0, 2.0),)
     assert explain_run(store, record, "numbers")[1].action == "cached"
+    moved = Store((tmp_path / "store").rename(tmp_path / "elsewhere"))
+    assert explain_run(moved, record, "total")[0].changes == found.changes
     with pytest.raises(SpecError, match="its stages are numbers, total, report"):
         explain_run(store, record, "totl")
 

@@ -91,7 +91,9 @@ def explain_run(store: Store, record: RunRecord, stage: str) -> list[Explanation
 
 
 def _explain_step(store: Store, step: StepRecord) -> Explanation:
-    stored = store.read(Path(step.path)) if step.path else None
+    # By fingerprint, for the home may have been moved since.
+    made = step.status == "completed" and step.fingerprint is not None
+    stored = store.read(store.path_of(step.name, str(step.fingerprint))) if made else None
     path = stored.path if stored is not None else None
     if step.status != "completed":
         why = " ".join(filter(None, [step.error, f"(begun because: {step.reason})" if step.reason else None]))
