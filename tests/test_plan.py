@@ -104,7 +104,16 @@ HEAVY = "numpy torch prefect mlflow open3d cv2 pandas pyarrow onnxruntime scipy 
 
 
 @pytest.mark.parametrize(
-    "arguments", [["plan", "demo"], ["list"], ["explain", "demo", "reconstruct"], ["verify"], ["--help"]]
+    "arguments",
+    [
+        ["plan", "demo"],
+        ["flow", "demo"],
+        ["list"],
+        ["gc"],
+        ["explain", "demo", "reconstruct"],
+        ["verify"],
+        ["--help"],
+    ],
 )
 def test_planning_commands_import_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
     code = (
