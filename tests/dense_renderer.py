@@ -123,7 +123,7 @@ def background_samples(
         places.append((edge + length / 2, length))
         edge += length
     owned = [
-        (float(rays.hits.near[h]), float(rays.hits.far[h]))
+        (float(rays.hits.owned_near[h]), float(rays.hits.owned_far[h]))
         for h in np.flatnonzero(rays.hits.ray.numpy() == index)
     ]
     samples = []

@@ -15,7 +15,15 @@ from genassets.rendering.compositing import accumulate, depth_order, render_weig
 from genassets.rendering.culling import CoarseActors, cull
 from genassets.rendering.evaluation import ActorFields, BackgroundFields
 from genassets.rendering.occupancy import background_occupancy, coarse_distance, prior_distances
-from genassets.rendering.rays import BOX_PADDING, Footprints, Hits, Rays, cast_rays, concatenate_rays
+from genassets.rendering.rays import (
+    BOX_PADDING,
+    CLEARANCE,
+    Footprints,
+    Hits,
+    Rays,
+    cast_rays,
+    concatenate_rays,
+)
 from genassets.rendering.render_settings import RenderSettings
 from genassets.rendering.renderer import SampleCounts, render_rays
 from genassets.rendering.rgb_network import RgbNetwork
@@ -156,12 +164,12 @@ def test_counts_are_those_of_a_plain_count() -> None:
     grid = background.occupancy
     in_boxes = outside = occupied = 0
     for ray in range(len(rays)):
-        spans = [
-            (float(hits.near[h]), float(hits.far[h])) for h in range(len(hits)) if int(hits.ray[h]) == ray
-        ]
+        of_ray = [h for h in range(len(hits)) if int(hits.ray[h]) == ray]
+        spans = [(float(hits.near[h]), float(hits.far[h])) for h in of_ray]
+        owned = [(float(hits.owned_near[h]), float(hits.owned_far[h])) for h in of_ray]
         in_boxes += sum(int(np.ceil((far - near) / SETTINGS.actor_step)) for near, far in spans)
         for place in places:
-            if any(near <= place <= far for near, far in spans):
+            if any(near <= place <= far for near, far in owned):
                 continue
             outside += 1
             point = rays.origin[ray].numpy() + place * rays.direction[ray].numpy()
@@ -312,3 +320,22 @@ def test_the_image_network_reaches_as_far_as_it_says(
     read = torch.nonzero(features.grad[0].abs().sum(dim=(0, 1)))[:, 0]
     assert network.reach == reach
     assert read.tolist() == list(range(middle - reach, middle + reach + 1))
+
+
+def test_the_lowest_decimetres_of_a_box_are_the_backgrounds_too() -> None:
+    length, padding = 2.25, BOX_PADDING[2]
+    bottom = -CAR[2] / 2
+    # Straight down through the roof; level, above and below the clearance; a car so low that a quarter of it is less.
+    origins = np.array([[0.0, 0, 3], [-5, 0, bottom + CLEARANCE + 0.01], [-5, 0, bottom + CLEARANCE - 0.01]])
+    directions = np.array([[0.0, 0, -1], [1, 0, 0], [1, 0, 0]])
+    hits = cast_rays(origins, directions, [0], np.eye(4)[None], CAR[None]).hits
+    near, far = hits.owned_near.tolist(), hits.owned_far.tolist()
+    assert (near[0], far[0]) == pytest.approx((3 + bottom - padding, 3 - bottom - CLEARANCE))
+    assert (near[1], far[1]) == pytest.approx((5 - length, 5 + length))
+    assert near[2] > far[2]
+    assert hits.far[0] == pytest.approx(3 - bottom + padding), (
+        "the actor itself may fill the whole padded box"
+    )
+    low = np.array([4.0, 2.0, 0.4])
+    hits = cast_rays(origins[:1], directions[:1], [0], np.eye(4)[None], low[None]).hits
+    assert float(hits.owned_far[0]) == pytest.approx(3 + 0.2 - 0.1)

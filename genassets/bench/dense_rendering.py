@@ -107,7 +107,7 @@ def _background_samples(
     for hits in _places(rays):
         ray = crossed.ray[hits]
         at = distance[ray]
-        there[ray] &= (at < crossed.near[hits, None]) | (at > crossed.far[hits, None])
+        there[ray] &= (at < crossed.owned_near[hits, None]) | (at > crossed.owned_far[hits, None])
     there[:, len(steps) :] = True
     absorbed = absorbed * there
     absorbed[:, -1] = -100.0  # the last of the sky is opaque

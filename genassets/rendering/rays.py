@@ -18,10 +18,18 @@ from genassets.geometry.transforms import invert_pose, transform_directions, tra
 BOX_PADDING = (0.25, 0.25, 0.10)
 """Padding of an actor's box for sampling along length, width and height, in metres on every side."""
 
+CLEARANCE = 0.15
+"""Metres above the bottom of an actor's labelled box up to which the background has samples too, so that road and
+shadow need not be learned once more with every actor; a quarter of the height at most."""
+
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays cross actor boxes: one entry a ray-box pair, everything in that box's frame."""
+    """Where rays cross actor boxes: one entry a ray-box pair, everything in that box's frame.
+
+    near to far is the way through the padded box, owned_near to owned_far that part of it where the background has no
+    samples (owned_near > owned_far where there is none).
+    """
 
     ray: Int[Tensor, " hits"]
     actor: Int[Tensor, " hits"]
@@ -29,6 +37,8 @@ class Hits:
     direction: Float[Tensor, "hits 3"]
     near: Float[Tensor, " hits"]
     far: Float[Tensor, " hits"]
+    owned_near: Float[Tensor, " hits"]
+    owned_far: Float[Tensor, " hits"]
 
     def __len__(self) -> int:
         return len(self.ray)
@@ -94,12 +104,15 @@ def cast_rays(
         near, far = intersect_box(origin, direction, size + 2 * np.array(BOX_PADDING))
         near, far = np.maximum(near, 0.0), np.minimum(far, limit)
         hit = np.flatnonzero(near < far)
-        parts.append((hit, np.full(len(hit), index), origin[hit], direction[hit], near[hit], far[hit]))
+        origin_of_hits, direction_of_hits = origin[hit], direction[hit]
+        owned = _above_the_ground(origin_of_hits, direction_of_hits, size)
+        actor = np.full(len(hit), index)
+        parts.append((hit, actor, origin_of_hits, direction_of_hits, near[hit], far[hit], *owned))
         if footprints:
             met, *at = _on_the_ground(origin, direction, size)
             shaded.append((met, np.full(len(met), index), *at))
     number, length, vector = np.zeros(0, int), np.zeros(0), np.zeros((0, 3))
-    ray, actor, *rest = _columns(parts, (number, number, vector, vector, length, length))
+    ray, actor, *rest = _columns(parts, (number, number, vector, vector, *[length] * 4))
     below, owner, *at = _columns(shaded, (number, number, vector[:, :2], length, length))
 
     def cast(array: NDArray) -> Tensor:
@@ -116,6 +129,17 @@ def cast_rays(
 
 def _columns(rows: Sequence[tuple[NDArray, ...]], empty: tuple[NDArray, ...]) -> list[NDArray]:
     return [np.concatenate(column) for column in zip(empty, *rows, strict=True)]
+
+
+def _above_the_ground(
+    origin: NDArray[np.float64], direction: NDArray[np.float64], size: NDArray[np.float64]
+) -> tuple[NDArray, NDArray]:
+    """Where rays (N, 3) of a box frame enter and leave the padded box without what is below CLEARANCE, in metres."""
+    bottom = -size[2] / 2 + min(CLEARANCE, size[2] / 4)
+    top = size[2] / 2 + BOX_PADDING[2]
+    raised = size + 2 * np.array(BOX_PADDING)
+    raised[2] = top - bottom
+    return intersect_box(origin - np.array((0.0, 0.0, (top + bottom) / 2)), direction, raised)
 
 
 def _on_the_ground(
@@ -164,6 +188,8 @@ def concatenate_rays(parts: Sequence[Rays]) -> Rays:
             torch.cat([h.direction for h in hits]),
             torch.cat([h.near for h in hits]),
             torch.cat([h.far for h in hits]),
+            torch.cat([h.owned_near for h in hits]),
+            torch.cat([h.owned_far for h in hits]),
         ),
         Footprints(
             torch.cat([p.ray + int(start) for p, start in zip(prints, starts, strict=False)]),

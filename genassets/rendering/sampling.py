@@ -131,7 +131,8 @@ def sample_sky(rays: Rays, count: int, start: float) -> BackgroundSamples:
 
 def _owned_by_actors(rays: Rays, distance: Float[Tensor, "rays steps"]) -> Bool[Tensor, "rays steps"]:
     hits = rays.hits
-    inside = (distance[hits.ray] >= hits.near[:, None]) & (distance[hits.ray] <= hits.far[:, None])
+    of_ray = distance[hits.ray]
+    inside = (of_ray >= hits.owned_near[:, None]) & (of_ray <= hits.owned_far[:, None])
     owned = torch.zeros_like(distance, dtype=torch.int32)
     return owned.index_add_(0, hits.ray, inside.int()) > 0
 
