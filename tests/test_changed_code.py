@@ -8,24 +8,16 @@ from typing import Any
 
 import pytest
 
-from genassets.pipeline import plan
 from genassets.pipeline.run_record import RunRecord
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
-from tests.toy_pipeline import NUMBERS, REPORT, TOTAL, run_toy, states
+from tests.toy_pipeline import NUMBERS, REPORT, TOTAL, drawn_module, run_toy, states
 
 MODULE = "genassets.drawn"
 
 
 @pytest.fixture
 def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A module of a package that the stages below are said to depend on."""
-    file = tmp_path / "source" / "genassets" / "drawn.py"
-    file.parent.mkdir(parents=True)
-    (file.parent / "__init__.py").write_text("")
-    file.write_text("A = 1\n")
-    monkeypatch.setattr(plan, "SOURCE_ROOT", tmp_path / "source")
-    monkeypatch.setattr(plan, "_CODE_OF_PROCESS", {})
-    return file
+    return drawn_module(tmp_path, monkeypatch)
 
 
 def depending(stage: Stage, after: Any = None) -> Stage:

@@ -207,10 +207,10 @@ def test_the_defaults_are_bevformer_tinys() -> None:
 def test_layers_have_the_sizes_of_bevformer_tiny() -> None:
     model = Detector(DetectorSettings())
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items()}
-    assert shapes["encoder.layers.0.plane.attention.offsets.weight"] == (128, 512)
-    assert shapes["encoder.layers.0.plane.attention.weights.weight"] == (64, 512)
-    assert shapes["encoder.layers.0.image.attention.offsets.weight"] == (128, 256)
-    assert shapes["encoder.layers.0.image.attention.weights.weight"] == (64, 256)
+    assert shapes["encoder.layers.0.plane.offsets.weight"] == (128, 512)
+    assert shapes["encoder.layers.0.plane.weights.weight"] == (64, 512)
+    assert shapes["encoder.layers.0.image.offsets.weight"] == (128, 256)
+    assert shapes["encoder.layers.0.image.weights.weight"] == (64, 256)
     assert shapes["decoder.layers.0.plane.offsets.weight"] == (64, 256)
     assert shapes["encoder.rows.weight"] == (50, 128)
     assert shapes["decoder.queries.weight"] == (900, 512)

@@ -28,7 +28,13 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("genassets.rendering",),
     ("genassets.fields",),
     ("genassets.driving",),
-    ("genassets.geometry", "genassets.perceptual", "genassets.weights", "genassets.checkpoint"),
+    (
+        "genassets.geometry",
+        "genassets.perceptual",
+        "genassets.weights",
+        "genassets.checkpoint",
+        "genassets.model_file",
+    ),
     ("genassets.package_archive", "genassets.city_spec", "genassets.system_libraries"),
     ("genassets.errors",),
 )

@@ -11,7 +11,6 @@ import yaml
 
 from genassets.cli import launch
 from genassets.errors import SpecError
-from genassets.pipeline import plan
 from genassets.pipeline.executor import execute
 from genassets.pipeline.explanation import explain_run
 from genassets.pipeline.history import History
@@ -19,7 +18,19 @@ from genassets.pipeline.plan import Selection, make_plan
 from genassets.pipeline.run_record import SPEC_FILE, RunRecord
 from genassets.pipeline.store import Store
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
-from tests.toy_pipeline import NUMBERS, REPORT, SPEC, TOTAL, TOY_SPECS, TOYS, run_toy, states, toy_workflow
+from tests.toy_pipeline import (
+    NUMBERS,
+    REPORT,
+    SPEC,
+    TOTAL,
+    TOY_SPECS,
+    TOYS,
+    drawn_module,
+    forget_code,
+    run_toy,
+    states,
+    toy_workflow,
+)
 
 
 @pytest.fixture
@@ -138,19 +149,7 @@ def test_force_makes_a_stage_again_and_what_hangs_on_it_only_by_content(tmp_path
 
 @pytest.fixture
 def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A module that `depending` stages are said to depend on; rewriting it is an edit of their code."""
-    file = tmp_path / "source" / "genassets" / "drawn.py"
-    file.parent.mkdir(parents=True)
-    (file.parent / "__init__.py").write_text("")
-    file.write_text("A = 1\n")
-    monkeypatch.setattr(plan, "SOURCE_ROOT", tmp_path / "source")
-    _forget_code(monkeypatch)
-    return file
-
-
-def _forget_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As in a new process, which sees the code as it is now."""
-    monkeypatch.setattr(plan, "_CODE_OF_PROCESS", {})
+    return drawn_module(tmp_path, monkeypatch)
 
 
 def depending(stage: Stage) -> Stage:
@@ -163,7 +162,7 @@ def test_accepted_code_serves_and_is_recorded(
     stages = (NUMBERS, depending(TOTAL), REPORT)
     _, first = run_toy(tmp_path, stages=stages)
     source.write_text("A = 1 + 0\n")
-    _forget_code(monkeypatch)
+    forget_code(monkeypatch)
     accepting = Selection(accept_code=("total",))
     planned = {i.step.key: i for i in make_plan(toy_workflow(tmp_path, (), accepting, stages=stages))}
     assert planned["total"].action == "accept"
@@ -191,7 +190,7 @@ def test_accepted_code_means_code_alone(
     stages = (NUMBERS, depending(TOTAL), REPORT)
     run_toy(tmp_path, stages=stages)
     source.write_text("A = 2\n")
-    _forget_code(monkeypatch)
+    forget_code(monkeypatch)
     accepting = Selection(accept_code=("total",))
     workflow = toy_workflow(tmp_path, ["total.scale=2"], accepting, stages=stages)
     planned = {item.step.key: item for item in make_plan(workflow)}
@@ -215,7 +214,7 @@ def test_a_damaged_object_is_not_accepted(
     _, first = run_toy(tmp_path, stages=stages)
     (Path(str(first.step("total").path)) / "total.json").write_text("7.0")  # as long as it was
     source.write_text("A = 2\n")
-    _forget_code(monkeypatch)
+    forget_code(monkeypatch)
     code, record = run_toy(tmp_path, selection=Selection(accept_code=("total",)), stages=stages)
     assert (code, "cannot be accepted, it is damaged" in str(record.step("total").error)) == (3, True)
 

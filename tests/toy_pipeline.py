@@ -13,8 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.pipeline import plan
 from genassets.pipeline.catalog import configs
 from genassets.pipeline.executor import Engine, RunListener, execute, run_inline
 from genassets.pipeline.home import Home
@@ -37,6 +39,22 @@ dataset:
 numbers:
   value: 3
 """
+
+
+def drawn_module(directory: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module, genassets.drawn, that stages may be said to depend on; rewriting it is an edit of their code."""
+    file = directory / "source" / "genassets" / "drawn.py"
+    file.parent.mkdir(parents=True)
+    (file.parent / "__init__.py").write_text("")
+    file.write_text("A = 1\n")
+    monkeypatch.setattr(plan, "SOURCE_ROOT", directory / "source")
+    forget_code(monkeypatch)
+    return file
+
+
+def forget_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a new process, which sees the code as it is now."""
+    monkeypatch.setattr(plan, "_CODE_OF_PROCESS", {})
 
 
 class NumbersConfig(BaseModel):

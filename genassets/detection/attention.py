@@ -6,7 +6,7 @@ import math
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 
@@ -32,6 +32,8 @@ def sample_and_weigh(
 class DeformableAttention(nn.Module):
     """Queries that look at a few places of each map around reference points.
 
+    What is found goes through a last layer; queries that `shown` leaves out find nothing.
+
     maps: how many maps of the same size are looked at with weights of their own and averaged (the bird's-eye map of now
     and of the frame before). groups: reference points a query; each has `points` places around it. Offsets are in
     cells of the map, and start on rays around the reference point, one direction a head.
@@ -45,7 +47,7 @@ class DeformableAttention(nn.Module):
         asked = asked or channels
         self.offsets = nn.Linear(asked, maps * heads * groups * points * 2)
         self.weights = nn.Linear(asked, maps * heads * groups * points)
-        self.values = nn.Linear(channels, channels)
+        self.values, self.out = nn.Linear(channels, channels), nn.Linear(channels, channels)
         self._start()
 
     def _start(self) -> None:
@@ -59,14 +61,16 @@ class DeformableAttention(nn.Module):
         bias = direction[:, None, None] * number[..., None]
         with torch.no_grad():
             self.offsets.bias.copy_(bias.expand(self.maps, -1, -1, -1, -1).reshape(-1))
-        nn.init.xavier_uniform_(self.values.weight)
-        nn.init.zeros_(self.values.bias)
+        for layer in (self.values, self.out):
+            nn.init.xavier_uniform_(layer.weight)
+            nn.init.zeros_(layer.bias)
 
     def forward(
         self,
         queries: Float[Tensor, "batch queries asked"],
         seen: Float[Tensor, "maps_batch height width channels"],
         reference: Float[Tensor, "batch queries groups 2"],
+        shown: Bool[Tensor, "batch queries"] | None = None,
     ) -> Float[Tensor, "batch queries channels"]:
         """seen: maps x batch maps, the maps of one batch entry beside each other. reference: as `sample_and_weigh`."""
         batch, count, _ = queries.shape
@@ -80,5 +84,6 @@ class DeformableAttention(nn.Module):
         def of_maps(tensor: Tensor) -> Tensor:
             return tensor.transpose(1, 2).flatten(0, 1)
 
-        out = sample_and_weigh(values, of_maps(places.flatten(4, 5)), of_maps(weights))
-        return out.reshape(batch, self.maps, count, -1).mean(dim=1)
+        found = sample_and_weigh(values, of_maps(places.flatten(4, 5)), of_maps(weights))
+        found = found.reshape(batch, self.maps, count, -1).mean(dim=1)
+        return self.out(found if shown is None else found * shown[..., None])

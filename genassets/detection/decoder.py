@@ -44,9 +44,6 @@ class DecoderLayer(nn.Module):
         channels = settings.channels
         self.among = nn.MultiheadAttention(channels, settings.heads, settings.dropout, batch_first=True)
         self.plane = DeformableAttention(channels, settings.heads, settings.plane_points)
-        self.out = nn.Linear(channels, channels)
-        nn.init.xavier_uniform_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
         self.dropouts = nn.ModuleList(nn.Dropout(settings.dropout) for _ in range(2))
         self.network = feed_forward(settings)
         self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
@@ -61,7 +58,7 @@ class DecoderLayer(nn.Module):
         asked = queries + position
         found = self.among(asked, asked, queries, need_weights=False)[0]
         queries = self.norms[0](queries + self.dropouts[0](found))
-        found = self.out(self.plane(queries + position, plane, reference[:, :, None]))
+        found = self.plane(queries + position, plane, reference[:, :, None])
         queries = self.norms[1](queries + self.dropouts[1](found))
         return self.norms[2](queries + self.network(queries))
 

@@ -68,61 +68,6 @@ def look_up(
     return Lookup(place, (depth > LEAST_DEPTH) & inside)
 
 
-class ImageAttention(nn.Module):
-    """Cells look into the image at the points above them; those that no image shows stay as they are."""
-
-    def __init__(self, settings: DetectorSettings) -> None:
-        super().__init__()
-        self.attention = DeformableAttention(
-            settings.channels, settings.heads, settings.points_a_height, groups=settings.heights
-        )
-        self.out = nn.Linear(settings.channels, settings.channels)
-        nn.init.xavier_uniform_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-        self.dropout = nn.Dropout(settings.dropout)
-
-    def forward(
-        self,
-        queries: Float[Tensor, "batch cells channels"],
-        position: Float[Tensor, "cells channels"],
-        image: Float[Tensor, "batch height width channels"],
-        lookup: Lookup,
-    ) -> Float[Tensor, "batch cells channels"]:
-        found = self.attention(queries + position, image, lookup.place)
-        # A mean over the cameras that see a cell, of which there is one.
-        found = found * lookup.seen.any(dim=-1)[..., None]
-        return queries + self.dropout(self.out(found))
-
-
-class PlaneAttention(nn.Module):
-    """Cells look at the bird's-eye map around them, the last frame's and this one's; alone, twice this one's."""
-
-    def __init__(self, settings: DetectorSettings) -> None:
-        super().__init__()
-        channels = settings.channels
-        self.attention = DeformableAttention(
-            channels, settings.heads, settings.plane_points, maps=2, asked=2 * channels
-        )
-        self.out = nn.Linear(channels, channels)
-        nn.init.xavier_uniform_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
-        self.dropout = nn.Dropout(settings.dropout)
-
-    def forward(
-        self,
-        queries: Float[Tensor, "batch cells channels"],
-        position: Float[Tensor, "cells channels"],
-        centres: Float[Tensor, "cells 2"],
-    ) -> Float[Tensor, "batch cells channels"]:
-        batch, count, _ = queries.shape
-        side = round(count**0.5)
-        asked = torch.cat((queries, queries + position), dim=-1)
-        plane = queries.reshape(batch, side, side, -1)
-        both = plane[:, None].expand(-1, 2, -1, -1, -1).flatten(0, 1)
-        reference = centres[None, :, None].expand(batch, -1, -1, -1)
-        return queries + self.dropout(self.out(self.attention(asked, both, reference)))
-
-
 def feed_forward(settings: DetectorSettings) -> nn.Sequential:
     """The network that every layer ends with; its input is added by the caller."""
     return nn.Sequential(
@@ -135,13 +80,20 @@ def feed_forward(settings: DetectorSettings) -> nn.Sequential:
 
 
 class EncoderLayer(nn.Module):
-    """Attention within the plane, into the image, and a network, each with its input added and normalised."""
+    """Attention within the plane, into the image, and a network, each with its input added and normalised.
+
+    Within the plane cells look at the last frame's map and at this one's; without history both are this one's. Into
+    the image they look at the points above them; cells that no image shows find nothing there.
+    """
 
     def __init__(self, settings: DetectorSettings) -> None:
         super().__init__()
-        self.plane, self.image = PlaneAttention(settings), ImageAttention(settings)
+        channels, heads = settings.channels, settings.heads
+        self.plane = DeformableAttention(channels, heads, settings.plane_points, maps=2, asked=2 * channels)
+        self.image = DeformableAttention(channels, heads, settings.points_a_height, groups=settings.heights)
+        self.dropouts = nn.ModuleList(nn.Dropout(settings.dropout) for _ in range(2))
         self.network = feed_forward(settings)
-        self.norms = nn.ModuleList(nn.LayerNorm(settings.channels) for _ in range(3))
+        self.norms = nn.ModuleList(nn.LayerNorm(channels) for _ in range(3))
 
     def forward(
         self,
@@ -151,8 +103,16 @@ class EncoderLayer(nn.Module):
         image: Float[Tensor, "batch height width channels"],
         lookup: Lookup,
     ) -> Float[Tensor, "batch cells channels"]:
-        queries = self.norms[0](self.plane(queries, position, centres))
-        queries = self.norms[1](self.image(queries, position, image, lookup))
+        batch, count, _ = queries.shape
+        side = round(count**0.5)
+        plane = queries.reshape(batch, side, side, -1)
+        both = plane[:, None].expand(-1, 2, -1, -1, -1).flatten(0, 1)
+        asked = torch.cat((queries, queries + position), dim=-1)
+        found = self.plane(asked, both, centres[None, :, None].expand(batch, -1, -1, -1))
+        queries = self.norms[0](queries + self.dropouts[0](found))
+        # One camera: the mean over those that see a cell is that one's, or nothing.
+        found = self.image(queries + position, image, lookup.place, lookup.seen.any(dim=-1))
+        queries = self.norms[1](queries + self.dropouts[1](found))
         return self.norms[2](queries + self.network(queries))
 
 

@@ -17,13 +17,14 @@ from genassets.errors import StageError
 from genassets.pipeline.file_digests import FileMemory
 
 PACKAGE = "genassets"
-# Message texts, the stage contract, the version, the fetching of files (whose bytes are pinned) and checkpoints (which
-# keep numbers as they are) carry none of their own; a change in them must not rerun stages.
+# Message texts, the stage contract, the version, the fetching of files (whose bytes are pinned), checkpoints and model
+# files (which keep numbers as they are) carry none of their own; a change in them must not rerun stages.
 WITHOUT_EFFECT = frozenset(
     {
         "genassets",
         "genassets.checkpoint",
         "genassets.errors",
+        "genassets.model_file",
         "genassets.package_archive",
         "genassets.stages",
         "genassets.stages.stage",

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from pydantic import BaseModel
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from genassets.driving.classes import CLASSES
 from genassets.errors import StageError
+from genassets.model_file import read_model, write_model
 from genassets.prior.conditions import TIMES
 from genassets.prior.model import SIZES, AssetPrior, Moments
 from genassets.prior.settings import PriorSettings
@@ -59,8 +57,7 @@ def save_prior(prior: AssetPrior, decoder: str, directory: Path) -> None:
         times=TIMES,
         decoder=decoder,
     )
-    tensors = {name: value.detach().contiguous() for name, value in prior.state_dict().items()}
-    save_file(tensors, directory / FILE, {"genassets": header.model_dump_json()})
+    write_model(directory / FILE, prior.state_dict(), header)
 
 
 def load_prior(directory: Path) -> TrainedPrior:
@@ -75,16 +72,10 @@ def load_prior(directory: Path) -> TrainedPrior:
             f"{path}: no prior here; expected the output of the train_prior stage. Run it first."
         )
     try:
-        with safe_open(path, "pt") as file:
-            values = json.loads((file.metadata() or {})["genassets"])
-            if values["format_version"] != FORMAT_VERSION:
-                raise ValueError(
-                    f"format_version is {values['format_version']}, this release reads {FORMAT_VERSION}"
-                )
-            header = _Header.model_validate(values)
-            if header.classes != CLASSES or header.times != TIMES:
-                raise ValueError(f"its classes are {', '.join(header.classes)} by {', '.join(header.times)}")
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        values, tensors = read_model(path, FORMAT_VERSION)
+        header = _Header.model_validate(values)
+        if header.classes != CLASSES or header.times != TIMES:
+            raise ValueError(f"its classes are {', '.join(header.classes)} by {', '.join(header.times)}")
         channels = header.latent_shape[0]
         prior = AssetPrior(
             header.settings,
@@ -95,7 +86,7 @@ def load_prior(directory: Path) -> TrainedPrior:
             seed=0,
         )
         prior.load_state_dict(tensors)
-    except (OSError, ValueError, LookupError, TypeError, RuntimeError, SafetensorError) as error:
+    except (OSError, ValueError, LookupError, TypeError, RuntimeError) as error:
         raise StageError(
             f"{path}: cannot be read ({error}); expected a prior as train_prior writes it. Remove it and run that "
             "stage again."

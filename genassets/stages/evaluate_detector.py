@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.errors import StageError
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
 from genassets.stages.train_detector import DETECTORS_FOLDER
 
@@ -46,6 +47,8 @@ def run(inputs: Inputs, config: EvaluateDetectorConfig, out: Path, context: Stag
     from genassets.export.picture_list import PictureList
 
     info_file = inputs.one("write_dataset") / SET_FOLDER / v0_file("val")
+    if not info_file.exists():
+        raise StageError("write_dataset.val names no log to test on; name one of the run's")
     files = sorted((inputs.one("train_detector") / DETECTORS_FOLDER).glob("*.safetensors"))
     rows, curves, pictures = [], {}, PictureList(out)
     for number, path in enumerate(files):

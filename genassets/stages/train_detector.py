@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.detection.settings import DetectorSettings, TrainingSettings
 from genassets.stages.stage import Inputs, Metric, Stage, StageContext
+
+if TYPE_CHECKING:
+    from genassets.detection.arms import Arm
+    from genassets.detection.frames import DetectionFrames
 
 DETECTORS_FOLDER = "detectors"
 
@@ -31,55 +35,75 @@ class TrainDetectorConfig(BaseModel):
 def run(inputs: Inputs, config: TrainDetectorConfig, out: Path, context: StageContext) -> list[Metric]:
     """Write detectors/<arm>-<share>-<seed>.safetensors.
 
-    All arms take as many steps: those that `training` says, or the epochs that it says of the recorded frames.
+    All arms take as many steps: those that `training` says, or its epochs of all recorded frames.
     """
     import math
     import shutil
 
-    from genassets.detection.arms import arms_of, frames_of
-    from genassets.detection.detector_file import save_detector
+    from genassets.detection.arms import REAL, Arm, arms_of, frames_of
     from genassets.detection.frames import DetectionFrames
     from genassets.detection.info_files import SET_FOLDER, v0_file
-    from genassets.detection.training import train_detector
 
     frames = DetectionFrames.open(
         inputs.one("write_dataset") / SET_FOLDER / v0_file("train"), config.detector
     )
+    training = config.training
+    recorded = len(frames_of(Arm(REAL, 1.0, 0), frames))
+    steps = training.steps or math.ceil(training.epochs * recorded / training.batch)
     arms = arms_of(frames, config.shares, config.seeds)
+    own = {arm: frames_of(arm, frames) for arm in arms}
     folder = context.work_dir / DETECTORS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     for number, arm in enumerate(arms):
-        finished = folder / f"{arm.key}.safetensors"
-        if finished.exists():  # a run that was killed has left it
-            continue
-        own = frames_of(arm, frames)
-        steps = config.training.steps or math.ceil(
-            config.training.epochs * len(frames_of(arms[0], frames)) / config.training.batch
-        )
-        work = context.work_dir / arm.key
-        work.mkdir(exist_ok=True)
-
-        def progress(
-            done: float, total: float, message: str, number: int = number, key: str = arm.key
-        ) -> None:
-            context.progress(number + done / total, len(arms), f"{key}: {message}")
-
-        def curve(name: str, step: int, value: float, key: str = arm.key) -> None:
-            context.curve(f"{key}/{name}", step, value)
-
-        training = config.training.model_copy(update={"steps": steps})
-        detector = train_detector(own, config.detector, training, arm.seed, work, progress, curve)
-        partial = finished.with_suffix(".partial")
-        save_detector(detector, partial)
-        partial.replace(finished)
-        shutil.rmtree(work)
+        if not (folder / f"{arm.key}.safetensors").exists():  # a run that was killed may have left it
+            settings = training.model_copy(update={"steps": steps})
+            _train(
+                arm, own[arm], config.detector, settings, folder, number / len(arms), 1 / len(arms), context
+            )
     shutil.copytree(folder, out / DETECTORS_FOLDER)
-    method = "count; frames that it learned from"
     return [
-        Metric(f"detector/{arm.key}", "train", "all", "frames", n, n, method)
-        for arm in arms
-        for n in [len(frames_of(arm, frames))]
+        Metric(
+            f"detector/{arm.key}",
+            "train",
+            "all",
+            "frames",
+            len(seen),
+            len(seen),
+            "count; frames learned from",
+        )
+        for arm, seen in own.items()
     ]
+
+
+def _train(
+    arm: Arm,
+    frames: DetectionFrames,
+    detector: DetectorSettings,
+    training: TrainingSettings,
+    folder: Path,
+    before: float,
+    part: float,
+    context: StageContext,
+) -> None:
+    """Train one arm, which is `part` of all work with `before` done, and put its file into a folder, whole."""
+    import shutil
+
+    from genassets.detection.detector_file import save_detector
+    from genassets.detection.training import train_detector
+
+    def progress(done: float, total: float, message: str) -> None:
+        context.progress(before + part * done / total, 1.0, f"{arm.key}: {message}")
+
+    def curve(name: str, step: int, value: float) -> None:
+        context.curve(f"{arm.key}/{name}", step, value)
+
+    work = context.work_dir / arm.key
+    work.mkdir(exist_ok=True)
+    trained = train_detector(frames, detector, training, arm.seed, work, progress, curve)
+    partial = folder / f"{arm.key}.partial"
+    save_detector(trained, partial)
+    partial.replace(folder / f"{arm.key}.safetensors")
+    shutil.rmtree(work)
 
 
 STAGE = Stage(
