@@ -81,6 +81,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
         f"stages=[{', '.join(NAMES)}]",
         f"evaluate_completion.library={library}",
         f"reconstruct.adapt.library={library}",
+        "train_detector.detector.pretrained=false",  # with it one backbone alone is valid
     ]
     experiment = load_experiment("demo", configs(CATALOG), overrides)
     found = Made(Home(folder / "home"), experiment, library)
