@@ -197,7 +197,7 @@ def test_a_mask_says_what_is_removed(wide: Log) -> None:
     }
     masks = RemovedMasks(pd.DataFrame([row]), wide.name)
     edits = [Edit(wide.track(PARKED), None)]
-    composer = Composer(wide, box_renderer(CAR_SIZE), edits, ComposeSettings(), masks)
+    composer = Composer(wide, box_renderer(CAR_SIZE), edits, ComposeSettings(shadow=False), masks)
     changed = sure(composer.compose(FRONT, 0)).changed
     assert (changed & mask).sum() == mask.sum()
     assert not changed[:, middle + 4 :].any()

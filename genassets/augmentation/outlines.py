@@ -74,13 +74,14 @@ class Outlines:
         region = region_of(grown.bounds, shot.intrinsics)
         outline = _inside_box(shot, track, settings.outline_margin, region)
         mask = self._mask(shot, track)
+        margin = settings.mask_margin
         if mask is not None:
             shape = mask[part(region)]
         elif track.actor_id in self._learned:
-            shape = self._silhouette(shot, track, region, FAINT)
+            shape, margin = self._silhouette(shot, track, region, FAINT), settings.silhouette_margin
         else:
             return region, outline
-        reach = max(1, round(settings.mask_margin * (region[3] - region[1])))
+        reach = max(1, round(margin * (region[3] - region[1])))
         return region, dilated(shape, reach) & outline
 
     def _mask(self, shot: Shot, track: Track) -> Bool[Mask, "height width"] | None:
