@@ -58,3 +58,7 @@ class ComposeSettings(BaseModel):
         default=None,
         description="share of the light that an asset takes beside it; none: as much as the log's own vehicles do",
     )
+    match_colour: bool = Field(
+        default=True,
+        description="whether assets of another log are made as bright as this one's vehicles, channel by channel",
+    )
