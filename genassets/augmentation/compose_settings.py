@@ -18,7 +18,7 @@ class ComposeSettings(BaseModel):
         default=1.0, description="size at which assets are rendered, as a share of the image's"
     )
     render_pixels: Annotated[int, Field(ge=64)] = Field(
-        default=60_000,
+        default=32_000,
         description="pixels of an asset's box at most that are rendered; a larger one is rendered coarser and enlarged",
     )
     outline_margin: Metres = Field(
