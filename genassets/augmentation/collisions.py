@@ -96,7 +96,7 @@ def _boxes_of_no_actor(log: Log) -> Mapping[int, Sequence[Footprint]]:
         if path is None:
             continue
         table = read_table(path)
-        others = table[[class_of(label) is None for label in table["label"]]]
+        others = table[np.array([class_of(label) is None for label in table["label"]], dtype=bool)]
         for yaw, x, y, z, width, length, height in others[list(_COLUMNS)].to_numpy(dtype=np.float64):
             if np.isfinite([yaw, x, y, z, width, length, height]).all():
                 pose = yaw_pose(yaw + np.pi / 2, np.array([x, y, z]))

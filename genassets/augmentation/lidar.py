@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 BOX_PADDING = 0.15
 """Metres around a removed actor's box within which returns are its own: mirrors, and centimetres of annotation."""
+NEIGHBOUR_PADDING = 0.05
+"""Metres around the box of an actor that stays within which returns are its, not a removed neighbour's."""
 ROAD = 0.08
 """Metres above the ground up to which returns in a removed actor's box are the road's."""
 ROUGHEST_FILL = 0.05
@@ -48,8 +50,9 @@ class Beams:
 
     @property
     def ends(self) -> Array:
-        """Where beams end (N, 3); not finite where nothing came back."""
-        return np.asarray(self.origins + self.lengths[:, None] * self.directions)
+        """Where beams end (N, 3); not a number where nothing came back."""
+        known = np.where(np.isfinite(self.lengths), self.lengths, np.nan)
+        return np.asarray(self.origins + known[:, None] * self.directions)
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ def change_beams(
         inside = known[points_in_box(ends[known], box.world_from_box, box.size, BOX_PADDING)]
         on_actor = inside[
             _above_road(ends[inside], box, ground)
-            & (_in_any(ends[inside], [box], 0.0) | ~_in_any(ends[inside], others, 0.0))
+            & (_in_any(ends[inside], [box], 0.0) | ~_in_any(ends[inside], others, NEIGHBOUR_PADDING))
         ]
         owner[on_actor] = index
         lengths[on_actor] = np.inf

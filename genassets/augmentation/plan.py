@@ -113,10 +113,9 @@ def _swaps(
     time = log.time_of_day if settings.time_of_day == "same" else None
     eligible = [track for track in eligible_tracks(log, assets, settings) if track.actor_id not in touched]
     wanted = settings.classes or {track.actor_class for track in eligible}
-    if settings.policy == "same_class":
-        assets.require(wanted, time)
-    elif not assets.rows_of(VEHICLE_CLASSES, time):
-        assets.require(VEHICLE_CLASSES[:1], time)
+    assets.require(
+        [name for name in wanted if not assets.rows_of(_classes(name, settings.policy), time)], time
+    )
     count = max(1, round(settings.fraction * len(eligible))) if eligible else 0
     chosen = [eligible[i] for i in sorted(np.random.default_rng(seeds).permutation(len(eligible))[:count])]
     edits: list[PlannedEdit] = []

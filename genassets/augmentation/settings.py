@@ -60,7 +60,7 @@ class LidarSettings(_Settings):
     )
     complete_rays: bool = Field(
         default=True,
-        description="Also cast the spinning LiDAR's rays that came back from nothing; a share of its rays is then lost.",
+        description="Also cast the spinning LiDAR's rays that came back from nothing; then `lost` holds.",
     )
     lost: float = Field(
         default=0.15,
