@@ -325,7 +325,7 @@ def test_a_track_of_one_frame_and_an_empty_frame(tmp_path: Path) -> None:
     log = steady_heights(open_log(root))
     assert all(len(track.frames) == 1 for track in log.tracks)
     made = augment(log, tmp_path / "out")
-    assert made.plan.count("swapped") == 2
+    assert made.plan.counts()["actors_swapped"] == 2
     assert {len(track.frames) for track in open_log(made.root).tracks} == {1}
     for name in ("annotations/cuboids/00.pkl.gz", "lidar/00.pkl.gz", "camera/front_camera/00.jpg"):
         assert (root / name).read_bytes() == (made.root / name).read_bytes(), (

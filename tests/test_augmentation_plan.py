@@ -86,7 +86,7 @@ def test_the_same_seed_gives_the_same_plan_and_another_variant_another(log: Log)
 
 def test_one_asset_takes_the_whole_track(log: Log) -> None:
     made = plan(log)
-    assert made.eligible == 2 and made.count("swapped") == 2
+    assert made.eligible == 2 and made.counts()["actors_swapped"] == 2
     for planned in made.edits:
         removed, asset = planned.edit.removed, planned.edit.placed
         assert removed is not None and asset is not None
@@ -95,10 +95,10 @@ def test_one_asset_takes_the_whole_track(log: Log) -> None:
 
 
 def test_the_fraction_is_of_the_actors_that_a_camera_sees(log: Log) -> None:
-    assert plan(log, fraction=0.5).count("swapped") == 1
-    assert plan(log, fraction=0.01).count("swapped") == 1, "some fraction is at least one actor"
+    assert plan(log, fraction=0.5).counts()["actors_swapped"] == 1
+    assert plan(log, fraction=0.01).counts()["actors_swapped"] == 1, "some fraction is at least one actor"
     behind = plan(log, cameras=("back_camera",))
-    assert behind.eligible == behind.count("swapped") == 0, "all actors are ahead of the car"
+    assert behind.eligible == behind.counts()["actors_swapped"] == 0, "all actors are ahead of the car"
 
 
 def test_policies_keep_and_change_classes(log: Log) -> None:
@@ -117,7 +117,7 @@ def test_policies_keep_and_change_classes(log: Log) -> None:
 
 def test_an_asset_of_the_actor_itself_is_no_change(log: Log) -> None:
     made = plan(log, WITH_OWN)
-    assert made.left_alone == {"no asset": 1} and made.count("swapped") == 1
+    assert made.left_alone == {"no asset": 1} and made.counts()["actors_swapped"] == 1
 
 
 def test_day_logs_take_day_assets(log: Log) -> None:

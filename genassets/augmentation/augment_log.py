@@ -25,7 +25,7 @@ from genassets.driving.log import Log
 from genassets.errors import LockedError, StageError
 
 NOTES = "meta/genassets.json"
-IDENTITY = "identity.json"
+RUN = "run"
 FRAMES = "frames"
 LOG = "log"
 
@@ -94,9 +94,8 @@ def augment_log(
     work.mkdir(parents=True, exist_ok=True)
     try:
         with FileLock(work / "lock", timeout=0):
-            identity = _identity(log, plan, settings, seed, library)
-            made = Made(log.name, library, seed, hashlib.sha256(identity.encode()).hexdigest()[:16])
-            _begin(work, identity)
+            made = Made(log.name, library, seed, run_id(log, plan, settings, seed, library))
+            _begin(work, made.run)
             edits = [planned.edit for planned in plan.edits]
             variant = Variant(log, edits, bodies, composer_of(log, edits), settings, seed)
             resumed, counts = _write_frames(work, variant, progress)
@@ -112,14 +111,23 @@ def augment_log(
     return Augmented(out, plan, dict(counts), resumed)
 
 
-def _begin(work: Path, identity: str) -> None:
-    """Keep what a run with the same identity left, and clear away what another did."""
-    file = work / IDENTITY
-    if file.is_file() and file.read_text(encoding="utf-8") == identity:
+def made_by(out: Path) -> str | None:
+    """The id of the run that wrote a changed log; None where there is none."""
+    try:
+        run = json.loads((out / NOTES).read_text(encoding="utf-8")).get("run")
+    except (OSError, ValueError, AttributeError):
+        return None
+    return run if isinstance(run, str) else None
+
+
+def _begin(work: Path, run: str) -> None:
+    """Keep what a run of the same id left, and clear away what another did."""
+    file = work / RUN
+    if file.is_file() and file.read_text(encoding="utf-8") == run:
         return
     for folder in (FRAMES, LOG):
         shutil.rmtree(work / folder, ignore_errors=True)
-    _write(file, identity.encode())
+    _write(file, run.encode())
 
 
 def _write_frames(
@@ -164,8 +172,8 @@ def _write_metadata(root: Path, log: Log, settings: AugmentSettings, made: Made)
     _write(root / NOTES, (json.dumps(known, indent=1, sort_keys=True) + "\n").encode())
 
 
-def _identity(log: Log, plan: Plan, settings: AugmentSettings, seed: int, library: str) -> str:
-    """What has to be the same for a run to be gone on with."""
+def run_id(log: Log, plan: Plan, settings: AugmentSettings, seed: int, library: str) -> str:
+    """The same for runs that make the same: log, edits, settings, seed and library."""
     edits: list[dict[str, Any]] = []
     for planned in plan.edits:
         removed, placed = planned.edit.removed, planned.edit.placed
@@ -189,4 +197,4 @@ def _identity(log: Log, plan: Plan, settings: AugmentSettings, seed: int, librar
         "library": library,
         "edits": edits,
     }
-    return json.dumps(document, indent=1, sort_keys=True)
+    return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:16]

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from genassets.augmentation.augment_log import ComposerOf
+from genassets.augmentation.compose import Composer
 from genassets.augmentation.edits import Edit
+from genassets.augmentation.outlines import RemovedMasks
 from genassets.augmentation.settings import AugmentSettings
 from genassets.augmentation.variant import ImageComposer
 from genassets.driving.log import Log
@@ -19,16 +21,14 @@ class KeptImages:
         return None
 
 
-def composer_of(renderer: SceneRenderer, settings: AugmentSettings) -> ComposerOf:
+def composer_of(
+    renderer: SceneRenderer, settings: AugmentSettings, masks: RemovedMasks | None = None
+) -> ComposerOf:
     """Makes the composer of a log and its edits; assets are drawn with the library's renderer."""
 
     def make(log: Log, edits: Sequence[Edit]) -> ImageComposer:
         if settings.images == "kept":
             return KeptImages()
-        from genassets.augmentation.compose import Composer
-        from genassets.augmentation.compose_settings import ComposeSettings
-
-        composer: ImageComposer = Composer(log, renderer, edits, ComposeSettings())
-        return composer
+        return Composer(log, renderer, edits, settings.compose, masks)
 
     return make

@@ -6,7 +6,7 @@ import zlib
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,15 @@ class Plan:
     left_alone: Mapping[str, int]
     retried: int
 
-    def count(self, origin: Origin) -> int:
-        return sum(planned.origin == origin for planned in self.edits)
+    def counts(self) -> dict[str, int]:
+        """What was planned, in numbers of actors and assets."""
+        origins = [planned.origin for planned in self.edits]
+        return {
+            **{f"actors_{origin}": origins.count(origin) for origin in get_args(Origin)},
+            "actors_eligible": self.eligible,
+            **{f"actors_left_alone_{reason.replace(' ', '_')}": n for reason, n in self.left_alone.items()},
+            "assets_retried": self.retried,
+        }
 
 
 def plan_variant(

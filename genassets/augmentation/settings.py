@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from genassets.augmentation.compose_settings import ComposeSettings
 from genassets.prior.settings import ClassName
 
 CameraName = Literal[
@@ -109,6 +110,7 @@ class AugmentSettings(_Settings):
         default="composed",
         description="Actors are swapped in the images too; or images stay as recorded, for detectors on LiDAR alone.",
     )
+    compose: ComposeSettings = ComposeSettings()
     lidar: LidarSettings = LidarSettings()
 
     @model_validator(mode="after")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -12,12 +12,6 @@ from genassets.cli.run import AsJson
 if TYPE_CHECKING:
     from genassets.augmentation.settings import AugmentSettings
 
-ORIGINS: tuple[Literal["swapped", "inserted", "rotated", "removed"], ...] = (
-    "swapped",
-    "inserted",
-    "rotated",
-    "removed",
-)
 ADVICE = (
     "expected a run that went through reconstruct. Finish it with `genassets resume`, or name another one."
 )
@@ -51,7 +45,7 @@ def augment(
     import json
 
     from genassets.augmentation.assets import Assets
-    from genassets.augmentation.augment_log import augment_log, augmented_name, check_source
+    from genassets.augmentation.augment_log import augment_log, augmented_name, made_by, run_id
     from genassets.augmentation.bodies import library_bodies
     from genassets.augmentation.composers import composer_of
     from genassets.augmentation.library_digest import library_digest
@@ -61,16 +55,17 @@ def augment(
 
     wanted = augment_settings(policy, fraction, variants, settings or [])
     source = steady_heights(open_log(log))
-    places = [out / augmented_name(source.name, number + 1) for number in range(wanted.variants)]
-    for place in places:
-        check_source(source, place)
     directory, times = library_of(assets)
     renderer = SceneRenderer.load(directory)
     table = Assets.of(str(directory), renderer.assets, times)
     bodies, digest = library_bodies(renderer, wanted.lidar.resolution), library_digest(directory)
     rows = []
-    for number, place in enumerate(places, start=1):
+    for number in range(1, wanted.variants + 1):
+        place = out / augmented_name(source.name, number)
         plan = plan_variant(source, table, bodies, wanted, seed, number)
+        if made_by(place) == run_id(source, plan, wanted, seed, digest):
+            typer.echo(f"{place}: is there already, made by the same command", err=True)
+            continue
         made = augment_log(
             source,
             plan,
@@ -83,16 +78,12 @@ def augment(
             place,
             progress=lambda done, total, message: typer.echo(f"  {message}", err=True) if message else None,
         )
-        row = {
-            "path": str(made.root),
-            **{f"{origin}_actors": plan.count(origin) for origin in ORIGINS},
-            "eligible_actors": plan.eligible,
-            "left_alone": dict(plan.left_alone),
-            **made.counts,
-        }
-        rows.append(row)
+        counts = {**plan.counts(), **made.counts}
+        rows.append({"path": str(made.root), **counts})
         if not as_json:
-            typer.echo(f"{made.root}: " + ", ".join(f"{k} {v}" for k, v in list(row.items())[1:]))
+            for name, value in counts.items():
+                typer.echo(f"{name:<32}{value:>12}")
+            typer.echo(str(made.root))
     if as_json:
         typer.echo(json.dumps(rows, indent=1))
 
