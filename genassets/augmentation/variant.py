@@ -136,7 +136,8 @@ class Variant:
         written = changed_jpeg(path.read_bytes(), composed.image, composed.changed)
         counts["images_changed"] += 1
         counts["pixels_changed"] += int(np.count_nonzero(composed.changed))
-        counts["pixels_rewritten"] += written.pixels
+        counts["pixels_rewritten"] += int(np.count_nonzero(written.region))
+        counts["images_encoded_anew"] += written.whole
         counts["assets_seen"] += sum(bool(mask.any()) for mask in composed.visible.values())
         yield FrameFile(f"camera/{camera}/{path.name}", written.content)
 
