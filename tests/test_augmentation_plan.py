@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from augmented import ASSETS, BUS, CAR, OWN, VAN, box_bodies, table
+from augmented import ASSETS, BUS, CAR, OWN, VAN, box_bodies, box_body, table
 from pydantic import ValidationError
 from tiny_log import CAR_SIZE, CONE, MOVING, PARKED, WALKER, build_tiny_log
 
@@ -278,3 +278,13 @@ def test_a_camera_that_the_log_lacks_is_named(tmp_path: Path) -> None:
     log = open_log(build_tiny_log(tmp_path / "tiny", frames=2, cameras=("front_camera",)))
     with pytest.raises(SpecError, match="log tiny has no back_camera, it has front_camera"):
         plan(log, cameras=("back_camera",))
+
+
+def test_assets_that_do_not_reach_the_ground_are_counted(log: Log) -> None:
+    high = box_body(CAR)
+    high = replace(high, bounds=high.bounds + np.array([[0.0, 0.0, 0.06], [0.0, 0.0, 0.0]]))
+    bodies = {0: high, 1: BODIES[1], 2: BODIES[2]}
+    made = [plan(log, seed=seed, bodies=bodies.__getitem__) for seed in range(8)]
+    rows = [[e.edit.placed.row for e in p.edits if e.edit.placed] for p in made]
+    assert [p.counts()["assets_floating"] for p in made] == [of_plan.count(0) for of_plan in rows]
+    assert high.gap(np.array([4.2, 1.8, 3.0])) == pytest.approx(0.12), "stretched, it floats higher"

@@ -26,6 +26,8 @@ from genassets.geometry.transforms import heading_of, invert_pose, transform_poi
 
 Origin = Literal["swapped", "inserted", "rotated", "removed"]
 
+FLOATING = 0.05
+"""Metres."""
 TRIES = 24
 """Assets that are tried for an actor before it is left alone."""
 
@@ -43,13 +45,15 @@ class Plan:
     """The edits of one variant of a log.
 
     eligible: how many actors may be swapped. left_alone: how many that were to be swapped were not, by reason.
-    retried: how many assets gave way to the next one, for they would have met something or have no surface.
+    retried: how many assets gave way to the next one, for they would have met something or have no surface. floating:
+    how many placed assets have no point within FLOATING of the ground contact.
     """
 
     edits: tuple[PlannedEdit, ...]
     eligible: int
     left_alone: Mapping[str, int]
     retried: int
+    floating: int
 
     def counts(self) -> dict[str, int]:
         """What was planned, in numbers of actors and assets."""
@@ -59,6 +63,7 @@ class Plan:
             "actors_eligible": self.eligible,
             **{f"actors_left_alone_{reason.replace(' ', '_')}": n for reason, n in self.left_alone.items()},
             "assets_retried": self.retried,
+            "assets_floating": self.floating,
         }
 
 
@@ -88,12 +93,16 @@ def plan_variant(
     for number, insertion in enumerate(settings.insert):
         rng = np.random.default_rng([seed, variant, number])
         edits.append(_inserted(insertion, log, assets, settings, surroundings, f"{identity}/{number}", rng))
-    if not settings.fraction:
-        return Plan(tuple(edits), 0, {}, 0)
-    swaps, eligible, left_alone, retried = _swaps(
-        log, assets, bodies, settings, surroundings, touched, identity, (seed, variant)
-    )
-    return Plan((*edits, *swaps), eligible, left_alone, retried)
+    eligible, retried = 0, 0
+    left_alone: dict[str, int] = {}
+    if settings.fraction:
+        swaps, eligible, left_alone, retried = _swaps(
+            log, assets, bodies, settings, surroundings, touched, identity, (seed, variant)
+        )
+        edits += swaps
+    placed = [planned.edit.placed for planned in edits if planned.edit.placed is not None]
+    floating = sum(bodies(asset.row).gap(asset.track.size) > FLOATING for asset in placed)
+    return Plan(tuple(edits), eligible, left_alone, retried, floating)
 
 
 def eligible_tracks(log: Log, assets: Assets, settings: AugmentSettings) -> list[Track]:
@@ -116,7 +125,7 @@ def _swaps(
     touched: Collection[str],
     identity: str,
     seeds: tuple[int, int],
-) -> tuple[list[PlannedEdit], int, Mapping[str, int], int]:
+) -> tuple[list[PlannedEdit], int, dict[str, int], int]:
     time = log.time_of_day if settings.time_of_day == "same" else None
     eligible = [track for track in eligible_tracks(log, assets, settings) if track.actor_id not in touched]
     wanted = settings.classes or {track.actor_class for track in eligible}

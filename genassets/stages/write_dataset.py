@@ -1,5 +1,7 @@
 """Write the dataset's logs as a detector set: info files for BEVFormer and mmdetection3d, provenance, data card.
 
+Where the run augments logs, those that train bring their changed ones with them.
+
 Writes set/ (docs/detection.md), which can be taken away as it is.
 """
 
@@ -34,6 +36,7 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
     from genassets.driving.image import read_image
     from genassets.errors import StageError
     from genassets.export.picture_list import PictureList
+    from genassets.stages.augment import LOGS
     from genassets.stages.ingested import ingested_root
 
     roots = {name: ingested_root(path) for name, path in inputs.shards("ingest").items()}
@@ -42,6 +45,11 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
             f"write_dataset.val: the dataset has no log {unknown[0]}; there are {', '.join(roots)}. Name one of them."
         )
     train = [root for name, root in roots.items() if name not in config.val]
+    if "augment" in inputs.objects:
+        changed = {
+            name: path / LOGS for name, path in inputs.shards("augment").items() if name not in config.val
+        }
+        train += [root for logs in changed.values() for root in sorted(logs.iterdir())]
     settings = LabelSettings(camera=config.camera, empty_frames=config.empty_frames)
     card = write_detection_set(
         out / SET_FOLDER, train, [roots[name] for name in config.val], settings, context.progress
@@ -71,5 +79,6 @@ STAGE = Stage(
     run=run,
     sharded=False,
     summary="Write the logs as a detector set",
+    uses=("augment",),
     on_request=True,
 )
