@@ -1,6 +1,4 @@
-"""Write the dataset's logs as a detector set: info files for BEVFormer and mmdetection3d, provenance, data card.
-
-Where the run augments logs, those that train bring their changed ones with them.
+"""Write the dataset's logs, with what was augmented, as a detector set: info files, provenance, data card.
 
 Writes set/ (docs/detection.md), which can be taken away as it is.
 """
@@ -46,10 +44,13 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
         )
     train = [root for name, root in roots.items() if name not in config.val]
     if "augment" in inputs.objects:
-        changed = {
-            name: path / LOGS for name, path in inputs.shards("augment").items() if name not in config.val
-        }
-        train += [root for logs in changed.values() for root in sorted(logs.iterdir())]
+        changed = inputs.shards("augment")
+        train += [
+            log
+            for name in roots
+            if name not in config.val
+            for log in sorted((changed[name] / LOGS).iterdir())
+        ]
     settings = LabelSettings(camera=config.camera, empty_frames=config.empty_frames)
     card = write_detection_set(
         out / SET_FOLDER, train, [roots[name] for name in config.val], settings, context.progress
@@ -70,6 +71,7 @@ STAGE = Stage(
     version=1,
     config=WriteDatasetConfig,
     needs=("ingest",),
+    uses=("augment",),
     modules=(
         "genassets.detection",
         "genassets.driving",
@@ -79,6 +81,5 @@ STAGE = Stage(
     run=run,
     sharded=False,
     summary="Write the logs as a detector set",
-    uses=("augment",),
     on_request=True,
 )
