@@ -32,6 +32,7 @@ from genassets.pipeline.run_record import (
 from genassets.pipeline.store import StoredObject
 from genassets.specs.document import read_document
 from genassets.specs.experiment import Experiment, load_experiment
+from genassets.tracking.address import shown_address
 from genassets.tracking.dead_runs import settle_dead_runs
 
 log = logging.getLogger("genassets.launch")
@@ -300,9 +301,16 @@ def _fields_that_differ(before: Mapping[str, Any], after: Mapping[str, Any]) -> 
     )
 
 
+class _WithoutPasswords(logging.Formatter):
+    """Lines and tracebacks, in which MLflow and Prefect quote addresses as they were given."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return shown_address(super().format(record))
+
+
 def _log_to(path: Path) -> logging.Handler:
     handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_WithoutPasswords("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("genassets")
     logger.addHandler(handler)
     logger.setLevel(os.environ.get("GENASSETS_LOG_LEVEL", "INFO"))

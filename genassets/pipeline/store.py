@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from genassets.errors import EnvironmentProblem, LockedError, StageError
@@ -312,6 +312,11 @@ def content_digest(files: Mapping[str, Mapping[str, Any]]) -> str:
 def _read_manifest(path: Path) -> StoredObject | None:
     try:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        if any(
+            PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts
+            for name in manifest["files"]
+        ):
+            return None  # not written here: files of an object lie in its directory
         return StoredObject(
             stage=manifest["stage"],
             shard=manifest["shard"],

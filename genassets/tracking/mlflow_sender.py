@@ -40,6 +40,8 @@ class MlflowSender:
             for name, value in {
                 "MLFLOW_DISABLE_TELEMETRY": "true",
                 "DO_NOT_TRACK": "1",
+                # It prints the whole address, with a password that is in it, between the lines of the progress.
+                "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
                 # A server that is away is found out in seconds: the spool keeps the events meanwhile.
                 "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
                 "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
