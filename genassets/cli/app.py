@@ -19,6 +19,7 @@ import typer
 
 from genassets import __version__
 from genassets.cli import dataset, weights
+from genassets.cli.augment import augment
 from genassets.cli.bench import bench
 from genassets.cli.compare import compare
 from genassets.cli.complete import complete
@@ -96,6 +97,7 @@ app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
 app.command("generate")(generate)
+app.command("augment")(augment)
 app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)
