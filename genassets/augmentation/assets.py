@@ -27,7 +27,7 @@ class Assets:
 
     @classmethod
     def of(cls, name: str, table: pd.DataFrame, times_of_logs: Mapping[str, str]) -> Assets:
-        """The assets of a library; generated ones know their time of day, others that of their log."""
+        """The assets of a library; those of earlier versions don't know their time of day, but that of their log."""
         if "time_of_day" in table:
             times = [str(time) for time in table["time_of_day"]]
         else:

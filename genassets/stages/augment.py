@@ -1,4 +1,4 @@
-"""Stage augment: changed logs, in which assets of the run's library stand for actors; genassets augment does one log.
+"""Stage augment: changed logs, in which assets of a library stand for actors; genassets augment does one log.
 
 Writes logs/<log>-aug1, .. : PandaSet directories with a table of provenance (docs/augmentation.md).
 """
@@ -8,19 +8,21 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
 from genassets.augmentation.settings import AugmentSettings
 from genassets.errors import StageError
-from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
+from genassets.stages.stage import MODEL_CODE, Borrowed, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     from genassets.driving import Log
     from genassets.export.picture_list import PictureList
 
 LOGS = "logs"
+MAKERS = {"reconstructed": "reconstruct", "generated": "generate"}
+"""The stages that make the kinds of assets."""
 DONE = "done"
 """In the work directory: variants that are whole, which a killed run does not make again."""
 
@@ -30,6 +32,11 @@ class AugmentConfig(AugmentSettings):
 
     assets: Literal["reconstructed", "generated"] = Field(
         default="reconstructed", description="Assets that were learned from logs, or drawn from the prior."
+    )
+    library: Annotated[str, Field(min_length=1)] | None = Field(
+        default=None,
+        description="Whose assets: a directory, the id of a run, or the name of an experiment, whose newest run that "
+        "made one is taken; by default this run's.",
     )
     logs: tuple[str, ...] | None = Field(
         default=None, description="Logs that are changed, by name; by default all."
@@ -41,8 +48,8 @@ def run(inputs: Inputs, config: AugmentConfig, out: Path, context: StageContext)
     """Write the variants of one log.
 
     Raises:
-        StageError: generated assets are asked for and the run generates none, `logs` names no log of the dataset, or as
-            in plan_variant and augment_log.
+        StageError: the run makes no such library and none is named, `logs` names no log of the dataset, or as in
+            plan_variant and augment_log.
     """
     from genassets.export.picture_list import PictureList
     from genassets.stages.ingested import open_ingested
@@ -85,7 +92,7 @@ def _variants(
     directory = _library(inputs, config)
     settings = AugmentSettings.model_validate(config.model_dump(include=set(AugmentSettings.model_fields)))
     renderer = SceneRenderer.load(directory)
-    name = f"the {config.assets} library"
+    name = config.library or f"the {config.assets} library"
     assets = Assets.of(name, renderer.assets, times_of_day(inputs.shards("ingest").values()))
     bodies, digest = library_bodies(renderer, settings.lidar.resolution), library_digest(directory)
     masks = None
@@ -116,14 +123,22 @@ def _variants(
 
 
 def _library(inputs: Inputs, config: AugmentConfig) -> Path:
-    if config.assets == "reconstructed":
-        return inputs.one("reconstruct")
-    if "generate" not in inputs.objects:
+    maker = MAKERS[config.assets]
+    if config.library is not None:
+        return inputs.borrowed[maker]
+    if maker not in inputs.objects:
         raise StageError(
-            "augment.assets is generated, but this run generates none; name generate among its `stages`, or set "
-            "augment.assets=reconstructed"
+            f"augment.assets is {config.assets}, but this run makes none; name {maker} among its `stages`, or a run "
+            "that has made some in augment.library"
         )
-    return inputs.one("generate")
+    return inputs.one(maker)
+
+
+def borrowed_library(config: AugmentConfig) -> tuple[Borrowed, ...]:
+    """The library of another run, where one is named."""
+    if config.library is None:
+        return ()
+    return (Borrowed(MAKERS[config.assets], "augment.library", config.library),)
 
 
 def _show(pictures: PictureList, log: Log, place: Path, config: AugmentConfig) -> None:
@@ -150,8 +165,8 @@ STAGE = Stage(
     name="augment",
     version=1,
     config=AugmentConfig,
-    needs=("ingest", "reconstruct"),
-    uses=("prepare_masks", "generate"),
+    needs=("ingest",),
+    uses=("prepare_masks", "reconstruct", "generate"),
     whole_inputs=frozenset({"ingest"}),
     modules=(
         "genassets.augmentation",
@@ -166,5 +181,6 @@ STAGE = Stage(
     run=run,
     sharded=True,
     summary="Swap actors of a log for assets: images, sweeps, boxes",
+    borrows=borrowed_library,
     on_request=True,
 )
