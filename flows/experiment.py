@@ -2,34 +2,56 @@
 
 from __future__ import annotations
 
-from typing import Any
+import shlex
+from functools import partial
+from typing import Annotated, Any
 
-from prefect import flow
+from prefect import flow, runtime
 from prefect.states import Cancelled, Completed, Failed
+from pydantic import Field
 
+from flows.artifacts import RunArtifacts, show_results
+from flows.failure_hook import tell_webhook
+from flows.gpu import stages_on_gpu
+from flows.parameters import STAGES, Settings, as_overrides
 from flows.tasks import run_as_task
-from genassets.cli.launch import RunRequest, launch, prepare
+from genassets.cli.launch import RunRequest, launch, prepare, resume_request
 from genassets.cli.progress import ProgressDisplay
 from genassets.pipeline.executor import INTERRUPTED, PARTLY_FAILED
+from genassets.pipeline.home import Home
+from genassets.pipeline.run_record import last_attempt
+
+StageName = Annotated[str, Field(json_schema_extra={"enum": STAGES})]
 
 
-@flow(name="experiment", flow_run_name="{spec}", persist_result=False)
+@flow(
+    name="experiment",
+    flow_run_name="{spec}",
+    persist_result=False,
+    on_failure=[tell_webhook],
+    on_crashed=[tell_webhook],
+)
 def experiment(
     spec: str = "demo",
+    settings: Settings | None = None,  # type: ignore[valid-type]  # mypy does not see made models
     overrides: list[str] | None = None,
-    start_from: str | None = None,
-    only: str | None = None,
+    start_from: StageName | None = None,
+    only: StageName | None = None,
     track: bool = True,
     run_id: str | None = None,
     resumes: str | None = None,
-    force: list[str] | None = None,
-    accept_code: list[str] | None = None,
+    force: list[StageName] | None = None,
+    accept_code: list[StageName] | None = None,
     retries: str | None = None,
 ) -> Any:
     """Run an experiment by the name or path of its spec.
 
+    A retry of the flow run goes on with the last attempt: its spec as it was, its finished stages from the store.
+
     Args:
-        overrides: settings such as "reconstruct.steps=2000".
+        spec: experiment by name (data_specs/experiments) or path of a YAML file.
+        settings: settings over those of the experiment's file.
+        overrides: settings as text, such as "reconstruct.steps=2000"; they win over the form's.
         start_from: run this stage and what hangs on it again.
         only: run nothing but this stage.
         track: record the run in MLflow.
@@ -41,7 +63,7 @@ def experiment(
     """
     request = RunRequest(
         spec,
-        tuple(overrides or ()),
+        (*(as_overrides(settings) if settings is not None else ()), *(overrides or ())),
         start_from,
         only,
         "prefect",
@@ -51,10 +73,22 @@ def experiment(
         tuple(accept_code or ()),
         retries,
     )
-    prepared = prepare(request, run_id)
+    flow_run = runtime.flow_run.id
+    earlier = last_attempt(Home.from_environment().runs, flow_run) if runtime.flow_run.run_count > 1 else None
+    if earlier is not None and earlier.retries is None:
+        request = resume_request(earlier.run_id, "prefect", track, as_saved=True)
+    prepared = prepare(request, run_id if earlier is None else None, _command(), flow_run)
+    engine = partial(run_as_task, on_gpu=stages_on_gpu(prepared.workflow))
     with ProgressDisplay() as display:
-        code = launch(prepared, [display], run_as_task)
+        code = launch(prepared, [display, RunArtifacts()], engine)
+    show_results(prepared.record, prepared.workflow.home)
     message = f"run {prepared.record.run_id}: {prepared.record.error or prepared.record.status}"
     if code == INTERRUPTED:
         return Cancelled(message=message)
     return Completed(message=message) if code in (0, PARTLY_FAILED) else Failed(message=message)
+
+
+def _command() -> str | None:
+    """What starts a deployment's runs; None where a person started this one with the `genassets` command."""
+    deployment = runtime.deployment.name
+    return shlex.join(["prefect", "deployment", "run", f"experiment/{deployment}"]) if deployment else None

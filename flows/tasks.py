@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
 
+from flows.gpu import GPU_TAG
 from genassets.errors import GenAssetsError
 from genassets.pipeline.executor import Outcome
 
@@ -24,12 +25,18 @@ def worth_retrying(task_definition: Any, task_run: Any, state: Any) -> bool:
     return isinstance(error, OSError | TimeoutError)
 
 
-def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]) -> Outcome:
+def run_as_task(
+    key: str, inputs: Mapping[str, str], work: Callable[[], Outcome], on_gpu: Collection[str] = ()
+) -> Outcome:
     """Engine that makes a Prefect task run of a step.
 
     The task's parameters are the fingerprints of the inputs and its result is the output's: never arrays.
     Prefect's cache is off; the store knows better whether a result is still good.
+
+    Args:
+        on_gpu: stages whose tasks carry the tag "gpu", which a server can limit.
     """
+    stage = key.partition("[")[0]
     outcomes: list[Outcome] = []
 
     def step(inputs: dict[str, str]) -> str:
@@ -37,8 +44,9 @@ def run_as_task(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]
         return outcomes[-1].stored.fingerprint
 
     as_task = task(
-        name=key.partition("[")[0],
+        name=stage,
         task_run_name=key,
+        tags=[GPU_TAG] if stage in on_gpu else None,
         cache_policy=NO_CACHE,
         persist_result=False,
         retries=len(RETRY_SECONDS),

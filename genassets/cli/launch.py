@@ -114,11 +114,15 @@ def load_resolved(run_directory: Path) -> Experiment:
     return load_experiment(str(run_directory / SPEC_FILE), configs(CATALOG))
 
 
-def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
+def prepare(
+    request: RunRequest, run_id: str | None = None, command: str | None = None, flow_run: str | None = None
+) -> PreparedRun:
     """Validate a request and make the run's resolved spec and record; runs that died before are set to crashed.
 
     Args:
         run_id: name of a directory already made for it below runs/; a new one by default.
+        command: what started the run; the command line by default.
+        flow_run: id of the Prefect flow run that it is an attempt of.
     """
     workflow = load_workflow(request)
     check_needs(workflow)
@@ -133,7 +137,7 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         run_id=directory.name,
         directory=directory,
         experiment=name,
-        command=shlex.join(["genassets", *sys.argv[1:]]),
+        command=command or shlex.join(["genassets", *sys.argv[1:]]),
         engine=request.engine,
         started=time.time(),
         stages=[StepRecord(step.stage.name, step.shard) for step in workflow.steps()],
@@ -145,6 +149,7 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         source=source,
         overrides=overrides,
         spec=resolved,
+        flow_run=flow_run,
     )
     record.save()
     return PreparedRun(request, workflow, record)

@@ -55,7 +55,8 @@ class RunRecord:
     """What became of a run; ``save`` after each change, so that run.json is true at any moment.
 
     ``source`` and ``overrides`` are what the spec was made from, ``spec`` is the resolved spec as plain values (that of
-    spec.yaml, unless someone edits it); ``retries`` is the run whose failed steps this one tries again.
+    spec.yaml, unless someone edits it); ``retries`` is the run whose failed steps this one tries again; ``flow_run`` is
+    the id of the Prefect flow run that it is an attempt of.
     """
 
     run_id: str
@@ -80,6 +81,7 @@ class RunRecord:
     source: str | None = None
     overrides: tuple[str, ...] = ()
     spec: dict[str, Any] | None = None
+    flow_run: str | None = None
 
     def step(self, key: str) -> StepRecord:
         """The record of a step by its key."""
@@ -169,6 +171,15 @@ def find_run(runs: Path, name: str | None) -> Path:
         shown = ", ".join(path.name for path in (fitting or known)[-5:])
         raise SpecError(f"run {name!r} is {'not one of' if not fitting else 'the start of several'}: {shown}")
     return fitting[0]
+
+
+def last_attempt(runs: Path, flow_run: str) -> RunRecord | None:
+    """The newest run that was an attempt of a Prefect flow run; None where there is none."""
+    for directory in reversed(list_runs(runs)):
+        record = RunRecord.load(directory)
+        if record.flow_run == flow_run:
+            return record
+    return None
 
 
 def list_runs(runs: Path) -> list[Path]:
