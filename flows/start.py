@@ -72,6 +72,8 @@ def run_flow(request: RunRequest) -> RunRecord:
             force=list(request.force),
             accept_code=list(request.accept_code),
             retries=request.retries,
+            workers=request.workers,
+            dask=request.dask,
             return_state=True,
         )
         record = RunRecord.load(directory)

@@ -10,7 +10,7 @@ from prefect.cache_policies import NO_CACHE
 
 from flows.gpu import GPU_TAG
 from genassets.errors import GenAssetsError
-from genassets.pipeline.executor import Outcome
+from genassets.pipeline.perform import Outcome
 
 RETRY_SECONDS = [2.0, 10.0]
 # A missing or forbidden file does not come back by trying again; a stale mount or a busy disk does.
@@ -36,13 +36,19 @@ def run_as_task(
     Args:
         on_gpu: stages whose tasks carry the tag "gpu", which a server can limit.
     """
-    stage = key.partition("[")[0]
     outcomes: list[Outcome] = []
 
     def step(inputs: dict[str, str]) -> str:
         outcomes.append(work())
         return outcomes[-1].stored.fingerprint
 
+    task_of(key, step, on_gpu)(inputs=dict(inputs))
+    return outcomes[-1]
+
+
+def task_of(key: str, step: Callable[[dict[str, str]], Any], on_gpu: Collection[str]) -> Any:
+    """The Prefect task of a step: named by its key, uncached, tried again only where that may help."""
+    stage = key.partition("[")[0]
     as_task = task(
         name=stage,
         task_run_name=key,
@@ -53,5 +59,4 @@ def run_as_task(
         retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=worth_retrying,
     )
-    as_task(step)(inputs=dict(inputs))
-    return outcomes[-1]
+    return as_task(step)

@@ -18,7 +18,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 import typer
 
 from genassets import __version__
-from genassets.cli import dataset, weights
+from genassets.cli import dataset, store, weights
 from genassets.cli.augment import augment
 from genassets.cli.bench import bench
 from genassets.cli.compare import compare
@@ -104,6 +104,7 @@ app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)
 app.add_typer(dataset.app, name="dataset")
+app.add_typer(store.app, name="store")
 app.add_typer(weights.app, name="weights")
 
 
