@@ -21,7 +21,13 @@ from genassets.augmentation.ground_shadow import (
 )
 from genassets.augmentation.other_frames import OtherFrames
 from genassets.augmentation.shot import Shot
-from genassets.augmentation.static_depth import StaticPoints, in_sight, surface_points
+from genassets.augmentation.static_depth import (
+    PointsInView,
+    StaticPoints,
+    in_sight,
+    points_in_view,
+    surface_points,
+)
 from genassets.augmentation.static_occluders import static_occluders
 from genassets.augmentation.uncovered import painted
 from genassets.driving import Log, Track, open_log
@@ -54,9 +60,15 @@ def points_of(*parts: Array) -> StaticPoints:
     points = np.concatenate(parts)
     sweep = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     found = SimpleNamespace(
-        with_sweeps=lambda frame: (points, sweep), around=lambda frame: points, frames=lambda frame: range(3)
+        before=lambda shot: points_in_view(shot, points, sweep),
+        around=lambda frame: points,
+        frames=lambda frame: range(3),
     )
     return cast(StaticPoints, found)
+
+
+def view(shot: Shot, points: Array) -> PointsInView:
+    return points_in_view(shot, points, np.zeros(len(points), dtype=np.int64))
 
 
 def wall(x: float, y: tuple[float, float], z: tuple[float, float], spacing: float = 0.15) -> Array:
@@ -89,7 +101,7 @@ def test_planes_are_met_exactly(wide: Log) -> None:
     rng = np.random.default_rng(0)
     ground = np.column_stack([rng.uniform(4, 30, 3000), rng.uniform(-12, 12, 3000), np.zeros(3000)])
     pixels = pixel_centres(60, 80, 130, 100)
-    found = surface_points(shot, ground, (60, 75, 130, 100), pixels)
+    found = surface_points(shot, view(shot, ground), (60, 75, 130, 100), pixels)
     assert np.isfinite(found).all()
     np.testing.assert_allclose(found[:, 2], 0, atol=1e-9)
     np.testing.assert_allclose(
@@ -99,7 +111,9 @@ def test_planes_are_met_exactly(wide: Log) -> None:
 
 def test_where_no_lidar_is_there_is_no_surface(wide: Log) -> None:
     shot = Shot(wide, FRONT, 1)
-    assert np.isnan(surface_points(shot, np.zeros((0, 3)), (0, 0, 20, 20), pixel_centres(0, 0, 5, 5))).all()
+    assert np.isnan(
+        surface_points(shot, view(shot, np.zeros((0, 3))), (0, 0, 20, 20), pixel_centres(0, 0, 5, 5))
+    ).all()
 
 
 def test_a_wall_hides_what_is_behind_it(wide: Log) -> None:
@@ -145,7 +159,7 @@ def test_a_surface_is_found_in_another_image(wide: Log) -> None:
     def image(camera: str, frame: int) -> NDArray[np.uint8]:
         shot = Shot(log, camera, frame)
         places = pixel_centres(0, 0, intrinsics.width, intrinsics.height)
-        seen = surface_points(shot, surface, (0, 0, intrinsics.width, intrinsics.height), places)
+        seen = surface_points(shot, view(shot, surface), (0, 0, intrinsics.width, intrinsics.height), places)
         rgb = np.nan_to_num(paint(seen)) * (0.9 if frame != 1 else 1.0)
         return np.rint(255 * rgb).reshape(intrinsics.height, intrinsics.width, 3).astype(np.uint8)
 
@@ -167,7 +181,7 @@ def test_a_hole_is_painted_with_what_is_around_it() -> None:
     hole[50:250, 100:380] = True
     image[hole] = 255
     error = np.abs(painted(image, hole).astype(int) - 90)
-    assert error.max() < 16 and error.mean() < 0.5  # the method adds some of its own
+    assert error.max() < 10 and error.mean() < 3  # the method loses a little light with every pixel inwards
 
 
 def test_light_is_taken_under_and_beside_a_footprint() -> None:

@@ -227,7 +227,7 @@ def test_a_deployment_fails_and_its_retry_makes_only_what_is_missing(tmp_path: P
             typed("deployment", "run", "experiment/demo", "--params", json.dumps(parameters))
             flow_run = post(f"{api}/flow_runs/filter", {})[0]["id"]
             failed = ended(flow_run, 1)
-            assert failed["state_type"] == "FAILED"
+            assert (failed["state_type"], failed["name"]) == ("FAILED", "tiny")
             shutil.move(tmp_path / "poses.json", poses)
             typed("flow-run", "retry", flow_run)
             assert ended(flow_run, 2)["state_type"] == "COMPLETED"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -12,20 +12,24 @@ from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
 from genassets.augmentation.compose_settings import ComposeSettings
-from genassets.augmentation.edits import Edit
-from genassets.augmentation.full_size import Layer, render_layer
+from genassets.augmentation.edits import Edit, PlacedAsset
+from genassets.augmentation.full_size import Layer, layer_region, render_layer
 from genassets.augmentation.ground_shadow import ground_around, light_left, measured_strength
+from genassets.augmentation.log_colour import assets_colour, gain, log_colour
 from genassets.augmentation.nearer_actors import nearer_actors
 from genassets.augmentation.outlines import Outlines, RemovedMasks
-from genassets.augmentation.shot import Shot, part, region_of
+from genassets.augmentation.shot import Region, Shot, bounds_of_mask, part, region_of
 from genassets.augmentation.static_depth import StaticPoints
 from genassets.augmentation.static_occluders import static_occluders
 from genassets.augmentation.uncovered import Uncovered
-from genassets.driving import Log
+from genassets.driving import Log, Track
 from genassets.reconstruction.scene_renderer import SceneRenderer
 
 CONTACT_SHARE = 0.7
 """Share of a shadow's reach beyond which so little of it is left that the ground is not made anew."""
+
+UNCOVERED_PIXELS = 8
+"""Pixels of a hole in the box of an actor behind it from which on that actor is rendered there."""
 
 OPAQUE = 0.995
 """Opacity above which what lies behind an asset is not worth making."""
@@ -63,10 +67,10 @@ class Composer:
         self._edits = tuple(edits)
         self._removed = [edit.removed for edit in edits if edit.removed is not None]
         self._placed = [edit.placed for edit in edits if edit.placed is not None]
-        self._tracks = {placed.track.actor_id: placed.track for placed in self._placed}
         gone = {track.actor_id for track in self._removed}
         self._kept = [track for track in log.tracks if track.actor_id not in gone]
-        self._outlines = Outlines(log.name, renderer, removed_masks)
+        self._learned = renderer.library.indices_of_log(log.name)
+        self._outlines = Outlines(log, renderer, removed_masks)
         lidar = settings.borrow or settings.static_occlusion
         self._static = StaticPoints(log, settings.reach, settings.sweeps) if lidar else None
         self._uncovered = Uncovered(log, renderer, self._static if settings.borrow else None, settings)
@@ -76,6 +80,10 @@ class Composer:
         if self._settings.shadow_strength is not None:
             return self._settings.shadow_strength
         return measured_strength(self._log, tuple(self._log.cameras))
+
+    @cached_property
+    def _colour(self) -> Float[NDArray[np.float64], " channels"] | None:
+        return log_colour(self._log, tuple(self._log.cameras))
 
     def compose(self, camera: str, frame: int) -> ComposedImage | None:
         """The changed image of a camera at a frame; None where nothing changes in it, or the log lacks it.
@@ -89,25 +97,28 @@ class Composer:
             return None
         shot = Shot(self._log, camera, frame)
         hole = self._hole(shot)
-        layers = self._layers(shot)
+        layers = self._layers(shot, hole)
         if not hole.any() and not layers:
             return None
         image = stream.image(frame)
         canvas = image.astype(np.float32) / np.float32(255)
-        shown = [self._shown(shot, layer) for layer in layers]
-        sunlit = self._fill(shot, image, canvas, hole, _coverage(hole.shape, layers, shown))
+        sunlit = self._fill(shot, image, canvas, hole, _coverage(hole.shape, layers))
         changed = hole.copy()
         if self._settings.shadow:
             changed |= self._shade(shot, canvas, sunlit)
-        visible: dict[str, NDArray[np.bool_]] = {}
-        for layer, alpha in zip(layers, shown, strict=True):
+        visible = {
+            placed.track.actor_id: np.zeros(hole.shape, dtype=bool)
+            for placed in self._placed
+            if layer_region(placed, shot) is not None
+        }
+        for layer in layers:
             window = part(layer.region)
-            canvas[window] += alpha[..., None] * (layer.rgb - canvas[window])
-            changed[window] |= alpha > 0
-            for other in visible.values():
-                other[window] &= alpha <= 0.5
-            visible[layer.actor_id] = np.zeros(hole.shape, dtype=bool)
-            visible[layer.actor_id][window] = alpha > 0.5
+            canvas[window] += layer.alpha[..., None] * (layer.rgb - canvas[window])
+            changed[window] |= layer.alpha > 0
+            for farther in visible.values():
+                farther[window] &= layer.alpha <= 0.5
+            if layer.actor_id in visible:
+                visible[layer.actor_id][window] = layer.alpha > 0.5
         if not changed.any():
             return None
         result = image.copy()
@@ -123,11 +134,7 @@ class Composer:
             found = self._outlines.covered(shot, edit.removed, self._settings)
             if found is not None:
                 region, covered = found
-                distance = shot.box_distance(edit.removed, region)
-                # Around the box itself, its middle says how far away the actor is.
-                middle = float(np.linalg.norm(shot.camera_from_box(edit.removed)[:3, 3]))
-                distance = np.where(np.isfinite(distance), distance, middle)
-                hidden = nearer_actors(shot, self._kept, self._outlines, region, distance)
+                hidden = self._hidden(shot, edit.removed, region)
                 hole[part(region)] |= covered & ~hidden
             if self._settings.shadow:
                 self._add_left_shadow(shot, edit, hole)
@@ -150,18 +157,69 @@ class Composer:
             shaded &= ~nearer_actors(shot, self._kept, self._outlines, ground.region, ground.distance)
             hole[part(ground.region)] |= shaded
 
-    def _layers(self, shot: Shot) -> list[Layer]:
-        """The placed assets in the image, the farthest first."""
-        layers = [render_layer(self._renderer, placed, shot, self._settings) for placed in self._placed]
+    def _layers(self, shot: Shot, hole: Bool[NDArray, "height width"]) -> list[Layer]:
+        """What is to be seen of placed assets, in the log's own light, and of actors behind a hole; farthest first."""
+        layers = []
+        for placed in self._placed:
+            region = layer_region(placed, shot)
+            layer = None
+            if region is not None:
+                layer = self._layer(shot, placed, region, ~self._hidden(shot, placed.track, region))
+            if layer is not None and self._static is not None and self._settings.static_occlusion:
+                before = static_occluders(shot, self._static, placed.track, layer.region, layer.distance)
+                layer = replace(layer, alpha=np.where(before, np.float32(0), layer.alpha))
+            layers.append(layer)
+        for placed in self._behind(shot, hole):
+            region = layer_region(placed, shot)
+            if region is not None:
+                open_to = hole[part(region)] & ~self._hidden(shot, placed.track, region)
+                layers.append(self._layer(shot, placed, region, open_to))
         return sorted((layer for layer in layers if layer is not None), key=lambda layer: -layer.depth)
 
-    def _shown(self, shot: Shot, layer: Layer) -> Float[NDArray[np.float32], "height width"]:
-        """A layer's opacity where nothing that is kept stands before it."""
-        hidden = nearer_actors(shot, self._kept, self._outlines, layer.region, layer.distance)
-        if self._static is not None and self._settings.static_occlusion:
-            track = self._tracks[layer.actor_id]
-            hidden |= static_occluders(shot, self._static, track, layer.region, layer.distance)
-        return np.where(hidden, np.float32(0), layer.alpha)
+    def _layer(
+        self, shot: Shot, placed: PlacedAsset, region: Region, open_to: Bool[NDArray, "height width"]
+    ) -> Layer | None:
+        """An asset where a region is open to the camera; None where it isn't, or nothing of the asset is there."""
+        if not open_to.any():
+            return None
+        x0, y0, x1, y1 = bounds_of_mask(open_to)
+        smaller = (region[0] + x0, region[1] + y0, region[0] + x1, region[1] + y1)
+        layer = render_layer(self._renderer, placed, shot, smaller, self._settings)
+        if layer is None:
+            return None
+        return replace(
+            layer,
+            rgb=np.clip(layer.rgb * self._gain(placed.row), 0, 1),
+            alpha=np.where(open_to[y0:y1, x0:x1], layer.alpha, np.float32(0)),
+        )
+
+    def _hidden(self, shot: Shot, track: Track, region: Region) -> Bool[NDArray, "height width"]:
+        """Where in a region kept actors stand before a track's box."""
+        distance = shot.box_distance(track, region)
+        # Around the box itself, its middle says how far away it is.
+        middle = float(np.linalg.norm(shot.camera_from_box(track)[:3, 3]))
+        distance = np.where(np.isfinite(distance), distance, middle)
+        kept = [other for other in self._kept if other.actor_id != track.actor_id]
+        return nearer_actors(shot, kept, self._outlines, region, distance)
+
+    def _behind(self, shot: Shot, hole: Bool[NDArray, "height width"]) -> list[PlacedAsset]:
+        """Kept actors that a hole may uncover and the library has learned from this log."""
+        found = []
+        for track in self._kept:
+            box = shot.box(track) if track.actor_id in self._learned else None
+            if (
+                box is not None
+                and hole[part(region_of(box.bounds, shot.intrinsics))].sum() >= UNCOVERED_PIXELS
+            ):
+                found.append(PlacedAsset(self._learned[track.actor_id], track))
+        return found
+
+    def _gain(self, row: int) -> Float[NDArray[np.float32], " channels"]:
+        """What the channels of an asset are multiplied by in this log."""
+        source = str(self._renderer.assets["log"].iloc[row])
+        if source == self._log.name or not self._settings.match_colour:
+            return np.ones(3, dtype=np.float32)
+        return gain(assets_colour(self._renderer.assets, source), self._colour)
 
     def _shade(
         self,
@@ -227,11 +285,9 @@ class Composer:
         return sunlit
 
 
-def _coverage(
-    shape: tuple[int, ...], layers: Sequence[Layer], shown: Sequence[NDArray[np.float32]]
-) -> Float[NDArray, "height width"]:
-    """How much of each pixel assets cover together."""
+def _coverage(shape: tuple[int, ...], layers: Sequence[Layer]) -> Float[NDArray, "height width"]:
+    """How much of each pixel layers cover together."""
     free = np.ones(shape, dtype=np.float32)
-    for layer, alpha in zip(layers, shown, strict=True):
-        free[part(layer.region)] *= 1 - alpha
+    for layer in layers:
+        free[part(layer.region)] *= 1 - layer.alpha
     return 1 - free

@@ -18,7 +18,7 @@ class ComposeSettings(BaseModel):
         default=1.0, description="size at which assets are rendered, as a share of the image's"
     )
     render_pixels: Annotated[int, Field(ge=64)] = Field(
-        default=60_000,
+        default=32_000,
         description="pixels of an asset's box at most that are rendered; a larger one is rendered coarser and enlarged",
     )
     outline_margin: Metres = Field(
@@ -57,4 +57,8 @@ class ComposeSettings(BaseModel):
     shadow_strength: Annotated[float, Field(ge=0, le=0.9)] | None = Field(
         default=None,
         description="share of the light that an asset takes beside it; none: as much as the log's own vehicles do",
+    )
+    match_colour: bool = Field(
+        default=True,
+        description="whether assets of another log are made as bright as this one's vehicles, channel by channel",
     )

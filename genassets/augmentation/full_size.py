@@ -36,22 +36,24 @@ class Layer:
     depth: float
 
 
+def layer_region(placed: PlacedAsset, shot: Shot) -> Region | None:
+    """The part of an image that a placed asset may take; None where it isn't in sight."""
+    projection = shot.box(placed.track, BOX_PADDING)
+    return None if projection is None else region_of(projection.bounds, shot.intrinsics)
+
+
 def render_layer(
-    renderer: SceneRenderer, placed: PlacedAsset, shot: Shot, settings: ComposeSettings
+    renderer: SceneRenderer, placed: PlacedAsset, shot: Shot, region: Region, settings: ComposeSettings
 ) -> Layer | None:
-    """A placed asset as the shot's camera sees it; None where nothing of it is in the image.
+    """A placed asset as the shot's camera sees it in a region; None where nothing of it is there.
 
     An asset that is drawn larger or smaller than it is in the library is stretched along its box's axes.
     """
-    projection = shot.box(placed.track, BOX_PADDING)
-    if projection is None:
-        return None
     asset = renderer.assets.iloc[placed.row]
     stretch = placed.track.size / asset[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
     camera_from_box = shot.camera_from_box(placed.track)
     # Directions come out stretched too, so that distances along rays stay those of the world.
     box_from_camera = np.diag([*(1 / stretch), 1.0]) @ invert_pose(camera_from_box)
-    region = region_of(projection.bounds, shot.intrinsics)
     window = shot.intrinsics.cropped(*region)
     scale = min(
         settings.render_scale, math.sqrt(settings.render_pixels / (window.width * window.height)), 1.0
@@ -71,7 +73,7 @@ def render_layer(
         np.clip(colour, 0, 1),
         np.where(alpha > SEEN, alpha, 0).astype(np.float32),
         np.where((alpha > SEEN) & (distance > 0), distance, np.inf).astype(np.float32),
-        projection.depth,
+        float(camera_from_box[2, 3]),
     )
 
 

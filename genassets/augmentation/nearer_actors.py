@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from genassets.augmentation.outlines import Outlines
-from genassets.augmentation.shot import Region, Shot
+from genassets.augmentation.shot import Region, Shot, overlap, region_of, within
 from genassets.driving import Track
 
 
@@ -27,15 +27,12 @@ def nearer_actors(
     """
     hidden = np.zeros(distance.shape, dtype=bool)
     for track in kept:
-        projection = shot.box(track)
-        if projection is None or not _overlap(projection.bounds, region):
+        box = shot.box(track)
+        common = None if box is None else overlap(region_of(box.bounds, shot.intrinsics), region)
+        if common is None:
             continue
-        nearer = shot.box_distance(track, region) < distance
+        inside = within(common, region)
+        nearer = shot.box_distance(track, common) < distance[inside]
         if nearer.any():
-            hidden |= nearer & outlines.shape(shot, track, region)
+            hidden[inside] |= nearer & outlines.shape(shot, track, common)
     return hidden
-
-
-def _overlap(bounds: tuple[float, float, float, float], region: Region) -> bool:
-    x0, y0, x1, y1 = bounds
-    return x0 < region[2] and x1 > region[0] and y0 < region[3] and y1 > region[1]

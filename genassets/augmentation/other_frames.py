@@ -13,14 +13,19 @@ from genassets.augmentation.shot import Shot
 from genassets.augmentation.static_depth import NEAREST, StaticPoints, in_sight
 from genassets.curation.occlusion import inside_convex
 from genassets.driving import Log
+from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import project
-from genassets.geometry.transforms import transform_points
+from genassets.geometry.transforms import invert_pose, make_pose, transform_points
 
 Array = NDArray[np.float64]
 Colours = NDArray[np.float32]
 
 ACTOR_PADDING = (0.6, 0.6, 0.15)
 """Metres around other actors' boxes, and the removed one's, that are not borrowed from: their shadows lie there."""
+
+EGO_SIZE = (5.2, 2.1, 1.8)
+EGO_CENTRE = (0.0, 0.0, 0.5)
+"""The ego car's body in its own frame, in metres, roughly: cameras see some of it, and not what lies under it."""
 
 IMAGES_AT_MOST = 4
 """Images that one hole is filled from: each one more adds seams."""
@@ -114,6 +119,7 @@ class OtherFrames:
         shown = (in_camera[:, 2] > NEAREST) & (in_camera[:, 2] < COARSER * depth)
         shown &= np.all((pixels > 1) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
         if shown.any():
+            shown &= ~_through_ego(other, points)
             for hull in self._hulls(other.camera, other.frame):
                 shown &= ~inside_convex(hull, pixels)
         return shown
@@ -164,3 +170,12 @@ class OtherFrames:
 
     def _read(self, camera: str, frame: int) -> UInt8[NDArray, "height width 3"]:
         return self._log.cameras[camera].image(frame)
+
+
+def _through_ego(shot: Shot, points: Float[Array, "points 3"]) -> Bool[NDArray[np.bool_], " points"]:
+    """Which world points a camera would have to see through the ego car."""
+    body_from_world = invert_pose(shot.log.world_from_ego[shot.frame] @ make_pose(np.eye(3), EGO_CENTRE))
+    ends = transform_points(body_from_world, points)
+    start = transform_points(body_from_world, shot.world_from_camera[:3, 3])
+    near, far = intersect_box(np.broadcast_to(start, ends.shape), ends - start, EGO_SIZE)
+    return np.asarray((near < far) & (near > 0) & (near < 1))

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import pandas as pd
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from genassets.augmentation.compose_settings import ComposeSettings
-from genassets.augmentation.shot import Region, Shot, part, region_of
+from genassets.augmentation.shot import Region, Shot, overlap, part, region_of, within
 from genassets.curation.object_table import mask_of
-from genassets.driving import Track
+from genassets.driving import Log, Track
 from genassets.geometry.transforms import invert_pose
 from genassets.masks.outlines import inside_outline
 from genassets.reconstruction.scene_renderer import SceneRenderer
 
 Mask = NDArray[np.bool_]
-SILHOUETTE_PIXELS = 4096
+SILHOUETTE_PIXELS = 1024
 """Rays at most for a silhouette: it only says where an actor is, not what it looks like."""
+
+LEAST_SIDE = 8
+"""Pixels of a box's shorter side below which the box itself is as good a silhouette."""
 
 FAINT = 0.2
 """Opacity of a silhouette from which a removed actor may be seen."""
@@ -48,9 +53,10 @@ class Outlines:
     stand in for masks that are missing; where the library does not know an actor either, its box does.
     """
 
-    def __init__(self, log_name: str, renderer: SceneRenderer, masks: RemovedMasks | None) -> None:
-        self._log_name, self._renderer, self._masks = log_name, renderer, masks
-        self._learned = frozenset(renderer.library.indices_of_log(log_name))
+    def __init__(self, log: Log, renderer: SceneRenderer, masks: RemovedMasks | None) -> None:
+        self._log, self._renderer, self._masks = log, renderer, masks
+        self._learned = frozenset(renderer.library.indices_of_log(log.name))
+        self._alpha = functools.lru_cache(maxsize=64)(self._render)
 
     def shape(self, shot: Shot, track: Track, region: Region) -> Bool[Mask, "height width"]:
         """Where in a region an actor in sight is to be expected, whatever stands before it."""
@@ -91,21 +97,31 @@ class Outlines:
         self, shot: Shot, track: Track, region: Region, opacity: float
     ) -> Bool[Mask, "height width"]:
         shape = np.zeros((region[3] - region[1], region[2] - region[0]), dtype=bool)
+        own, alpha = self._alpha(shot.camera, shot.frame, track.actor_id)
+        common = overlap(own, region)
+        if common is not None:
+            shape[within(common, region)] = alpha[within(common, own)] > opacity
+        return shape
+
+    def _render(
+        self, camera: str, frame: int, actor_id: str
+    ) -> tuple[Region, Float[NDArray[np.float32], "height width"]]:
+        """An actor's opacity in the region of its box, one pixel more on each side."""
+        shot = Shot(self._log, camera, frame)
+        track = self._log.track(actor_id)
         projection = shot.box(track)
         if projection is None:
-            return shape
-        x0, y0, x1, y1 = region_of(projection.bounds, shot.intrinsics, 1)
-        x0, y0, x1, y1 = max(x0, region[0]), max(y0, region[1]), min(x1, region[2]), min(y1, region[3])
-        if x0 >= x1 or y0 >= y1:
-            return shape
-        seen = shot.intrinsics.cropped(x0, y0, x1, y1)
+            return (0, 0, 0, 0), np.zeros((0, 0), dtype=np.float32)
+        region = region_of(projection.bounds, shot.intrinsics, 1)
+        if min(region[2] - region[0], region[3] - region[1]) < LEAST_SIDE + 2:
+            return region, _inside_box(shot, track, 0.0, region).astype(np.float32)
+        seen = shot.intrinsics.cropped(*region)
         scale = min(1.0, (SILHOUETTE_PIXELS / (seen.width * seen.height)) ** 0.5)
         small = seen.resized(max(1, round(seen.width * scale)), max(1, round(seen.height * scale)))
         pose = invert_pose(shot.camera_from_box(track))
-        view = self._renderer.render_actor(self._log_name, track.actor_id, small, pose)
+        view = self._renderer.render_actor(self._log.name, actor_id, small, pose)
         alpha = cv2.resize(view.alpha, (seen.width, seen.height), interpolation=cv2.INTER_LINEAR)
-        shape[y0 - region[1] : y1 - region[1], x0 - region[0] : x1 - region[0]] = alpha > opacity
-        return shape
+        return region, np.asarray(alpha, dtype=np.float32)
 
 
 def dilated(mask: Bool[Mask, "height width"], reach: int) -> Bool[Mask, "height width"]:

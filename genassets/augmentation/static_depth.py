@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -40,6 +41,15 @@ VIEW_CELLS = 96
 POINTS_OF_VIEW = 60_000
 
 
+@dataclass(frozen=True)
+class PointsInView:
+    """Static points before a camera: where they are in its frame and in its image, and the frames of their sweeps."""
+
+    in_camera: Float[Array, "points 3"]
+    pixels: Float[Array, "points 2"]
+    sweep: Int[NDArray[np.int64], " points"]
+
+
 class StaticPoints:
     """LiDAR points of a log outside all actors' boxes, from the frames around a frame.
 
@@ -52,14 +62,18 @@ class StaticPoints:
         self._origin = log.world_from_ego[:, :3, 3].mean(axis=0)
         self._sweep = functools.lru_cache(maxsize=2 * sweeps)(self._read)
         self._around = functools.lru_cache(maxsize=1)(self._gather)
+        self._view: tuple[tuple[str, int], PointsInView] | None = None
 
     def around(self, frame: int) -> Float[Array, "points 3"]:
         """World points from the frames around a frame; none where the log has no sweeps there."""
         return self._around(tuple(self.frames(frame)))[0]
 
-    def with_sweeps(self, frame: int) -> tuple[Float[Array, "points 3"], Int[NDArray[np.int64], " points"]]:
-        """The same, with the frame of each point's sweep."""
-        return self._around(tuple(self.frames(frame)))
+    def before(self, shot: Shot) -> PointsInView:
+        """Those of a shot's frame that are in its image, or at most half the image's size beside it."""
+        key = (shot.camera, shot.frame)
+        if self._view is None or self._view[0] != key:
+            self._view = (key, points_in_view(shot, *self._around(tuple(self.frames(shot.frame)))))
+        return self._view[1]
 
     def frames(self, frame: int) -> list[int]:
         """The frames whose sweeps count for a frame: evenly spread on a grid, so that neighbours share most of them."""
@@ -85,8 +99,22 @@ class StaticPoints:
         return (points[~taken] - self._origin).astype(np.float32)
 
 
+def points_in_view(
+    shot: Shot, points: Float[Array, "points 3"], sweep: Int[NDArray[np.int64], " points"]
+) -> PointsInView:
+    """World points that are in a shot's image, or at most half the image's size beside it."""
+    camera = shot.intrinsics
+    in_camera = transform_points(shot.camera_from_world, points)
+    ahead = np.flatnonzero(in_camera[:, 2] > NEAREST)
+    in_camera = in_camera[ahead]
+    pixels = project(camera, in_camera)
+    inside = (pixels[:, 0] > -camera.width / 2) & (pixels[:, 0] < 1.5 * camera.width)
+    inside &= (pixels[:, 1] > -camera.height / 2) & (pixels[:, 1] < 1.5 * camera.height)
+    return PointsInView(in_camera[inside], pixels[inside], sweep[ahead[inside]])
+
+
 def surface_points(
-    shot: Shot, points: Float[Array, "points 3"], region: Region, pixels: Float[Array, "pixels 2"]
+    shot: Shot, points: PointsInView, region: Region, pixels: Float[Array, "pixels 2"]
 ) -> Float[Array, "pixels 3"]:
     """World points of the static surface seen at pixels of a region; NaN where no LiDAR points lie around.
 
@@ -96,8 +124,15 @@ def surface_points(
     from scipy.spatial import QhullError
 
     nothing = np.full((len(pixels), 3), np.nan)
-    places, depth = _in_region(shot, points, region)
-    seen = _nearest_of_cells(places, depth, region)
+    x0, y0, x1, y1 = region
+    wide = (2 * x0 - x1, 2 * y0 - y1, 2 * x1 - x0, 2 * y1 - y0)
+    near = (points.pixels[:, 0] > wide[0]) & (points.pixels[:, 0] < wide[2])
+    near &= (points.pixels[:, 1] > wide[1]) & (points.pixels[:, 1] < wide[3])
+    places, depth = points.pixels[near], points.in_camera[near, 2]
+    size = max(x1 - x0, y1 - y0) / CELL
+    nearest = minimum_filter(_grid(places, depth, wide, size), (1, 3), mode="nearest")
+    cell = ((places - [wide[0], wide[1]]) / size).astype(np.int64)
+    seen = depth < nearest[cell[:, 1], cell[:, 0]] * (1 + SLACK_SHARE) + SLACK
     places, depth = places[seen], depth[seen]
     every = -(-len(places) // POINTS_AT_MOST)
     if len(places) < 4:
@@ -118,9 +153,10 @@ def in_sight(
     """Which world points are in a shot's image with no static point clearly before them."""
     camera = shot.intrinsics
     whole = (0, 0, camera.width, camera.height)
-    places, depth = _in_region(shot, static[:: max(1, len(static) // POINTS_OF_VIEW)], whole)
+    few = static[:: max(1, len(static) // POINTS_OF_VIEW)]
+    around = points_in_view(shot, few, np.zeros(len(few), dtype=np.int64))
     size = camera.width / VIEW_CELLS
-    nearest = _grid(places, depth, whole, size)
+    nearest = _grid(around.pixels, around.in_camera[:, 2], whole, size)
     in_camera = transform_points(shot.camera_from_world, points)
     asked = project(camera, in_camera)
     inside = (in_camera[:, 2] > NEAREST) & np.all(asked >= 1, axis=1)
@@ -132,18 +168,6 @@ def in_sight(
     return seen
 
 
-def _in_region(shot: Shot, points: Array, region: Region) -> tuple[Array, Array]:
-    """Pixels (N, 2) and depths (N,) of points in a region and around it, half its size on every side."""
-    in_camera = transform_points(shot.camera_from_world, points)
-    in_camera = in_camera[in_camera[:, 2] > NEAREST]
-    places = project(shot.intrinsics, in_camera)
-    x0, y0, x1, y1 = region
-    margin_x, margin_y = (x1 - x0) / 2, (y1 - y0) / 2
-    inside = (places[:, 0] > x0 - margin_x) & (places[:, 0] < x1 + margin_x)
-    inside &= (places[:, 1] > y0 - margin_y) & (places[:, 1] < y1 + margin_y)
-    return places[inside], in_camera[inside, 2]
-
-
 def _grid(places: Array, depth: Array, region: Region, size: float) -> Array:
     """The least depth in each cell of `size` pixels of a region and in the cells around it; infinite where none is."""
     x0, y0, x1, y1 = region
@@ -153,12 +177,3 @@ def _grid(places: Array, depth: Array, region: Region, size: float) -> Array:
     nearest = np.full((rows, columns), np.inf)
     np.minimum.at(nearest, (cell[inside, 1], cell[inside, 0]), depth[inside])
     return nearest
-
-
-def _nearest_of_cells(places: Array, depth: Array, region: Region) -> NDArray[np.bool_]:
-    x0, y0, x1, y1 = region
-    wide = (2 * x0 - x1, 2 * y0 - y1, 2 * x1 - x0, 2 * y1 - y0)
-    size = max(x1 - x0, y1 - y0) / CELL
-    nearest = minimum_filter(_grid(places, depth, wide, size), (1, 3), mode="nearest")
-    cell = ((places - [wide[0], wide[1]]) / size).astype(np.int64)
-    return np.asarray(depth < nearest[cell[:, 1], cell[:, 0]] * (1 + SLACK_SHARE) + SLACK)

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from genassets.augmentation.outlines import dilated
 from genassets.augmentation.shot import Region, Shot
-from genassets.augmentation.static_depth import NEAREST, StaticPoints
+from genassets.augmentation.static_depth import StaticPoints
 from genassets.driving import Track
 from genassets.geometry.boxes import points_in_box
-from genassets.geometry.cameras import project
 from genassets.geometry.transforms import invert_pose, transform_points
 
 Array = NDArray[np.float64]
@@ -45,21 +44,19 @@ def static_occluders(
     finite = np.isfinite(distance)
     if not finite.any():
         return hidden > 0
-    points, sweep = static.with_sweeps(shot.frame)
-    in_camera = transform_points(shot.camera_from_world, points)
+    points = static.before(shot)
+    places = points.pixels - np.array(region[:2])
     farthest = float(distance[finite].max())
-    near = np.flatnonzero((in_camera[:, 2] > NEAREST) & (in_camera[:, 2] < farthest))
-    places = project(shot.intrinsics, in_camera[near]) - np.array(region[:2])
-    inside = np.all((places >= 0) & (places < [width, height]), axis=1)
-    near, places = near[inside], places[inside]
-    along = np.linalg.norm(in_camera[near], axis=1)
+    inside = np.all((places >= 0) & (places < [width, height]), axis=1) & (points.in_camera[:, 2] < farthest)
+    in_camera, places, sweep = points.in_camera[inside], places[inside], points.sweep[inside]
+    along = np.linalg.norm(in_camera, axis=1)
     ahead = along < distance[places[:, 1].astype(int), places[:, 0].astype(int)] - BEFORE
-    near, places, along = near[ahead], places[ahead], along[ahead]
-    in_box = transform_points(invert_pose(shot.camera_from_box(track)), in_camera[near])
+    in_camera, places, sweep, along = in_camera[ahead], places[ahead], sweep[ahead], along[ahead]
+    in_box = transform_points(invert_pose(shot.camera_from_box(track)), in_camera)
     standing = in_box[:, 2] > -track.size[2] / 2 + GROUND
     standing &= ~points_in_box(in_box, np.eye(4), track.size, BEFORE)
-    near, places, along = near[standing], places[standing], along[standing]
-    lasting = _seen_again(points[near], sweep[near])
+    in_box, places, sweep, along = in_box[standing], places[standing], sweep[standing], along[standing]
+    lasting = _seen_again(in_box, sweep)
     places, along = places[lasting], along[lasting]
     if not len(places):
         return hidden > 0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from genassets.augmentation.compose_settings import ComposeSettings
 from genassets.augmentation.other_frames import GAIN_BOUNDS, OtherFrames
 from genassets.augmentation.outlines import dilated
-from genassets.augmentation.shot import Region, Shot, part
+from genassets.augmentation.shot import Shot, bounds_of_mask, part
 from genassets.augmentation.static_depth import StaticPoints, surface_points
 from genassets.driving import Log
 from genassets.reconstruction.scene_renderer import SceneRenderer
@@ -22,8 +22,9 @@ Colours = NDArray[np.float32]
 INPAINT_RADIUS = 3
 """Pixels around a hole that cv2.inpaint reads."""
 
-LONGEST_SIDE = 160
-"""Pixels of a hole's longer side that are painted; a larger one is painted small, as its time grows with the area."""
+LONGEST_SIDE = 80
+"""Pixels of a hole's longer side that are painted; a larger one is painted small: every step inwards loses a
+little light."""
 
 RING_SHARE = 0.12
 """Width of the ring around a hole that brightness is compared in, as a share of the hole's longer side."""
@@ -65,8 +66,8 @@ class Uncovered:
             wanted, around = _centres(needed), _centres(ring)
             surface = surface_points(
                 shot,
-                self._static.around(shot.frame),
-                _bounds(hole),
+                self._static.before(shot),
+                bounds_of_mask(hole),
                 np.concatenate([wanted, around]),
             )
             ours = image[ring].astype(np.float32) / np.float32(255)
@@ -89,7 +90,7 @@ class Uncovered:
         ring: Bool[NDArray, "height width"],
     ) -> UInt8[NDArray, "pixels 3"]:
         """The library's background at missing pixels, as bright as the image is around them."""
-        region = _bounds(missing | ring)
+        region = bounds_of_mask(missing | ring)
         small = self._renderer.render_intrinsics(self._empty, shot.camera)
         sx, sy = small.width / shot.intrinsics.width, small.height / shot.intrinsics.height
         asked = (
@@ -116,7 +117,7 @@ def painted(
     image: UInt8[NDArray, "height width 3"], hole: Bool[NDArray, "height width"]
 ) -> UInt8[NDArray, "pixels 3"]:
     """Colours of a hole's pixels, row by row, carried in from its border (Telea 2004)."""
-    x0, y0, x1, y1 = _bounds(hole)
+    x0, y0, x1, y1 = bounds_of_mask(hole)
     margin = 2 * INPAINT_RADIUS + 2
     height, width = hole.shape
     region = (max(x0 - margin, 0), max(y0 - margin, 0), min(x1 + margin, width), min(y1 + margin, height))
@@ -132,12 +133,6 @@ def painted(
     return np.asarray(enlarged[inside], dtype=np.uint8)
 
 
-def _bounds(mask: Bool[NDArray, "height width"]) -> Region:
-    """The smallest region that holds all of a mask, which is not empty."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
-
-
 def _centres(mask: Bool[NDArray, "height width"]) -> Float[NDArray[np.float64], "pixels 2"]:
     rows, columns = np.nonzero(mask)
     return np.stack([columns + 0.5, rows + 0.5], axis=1)
@@ -147,7 +142,7 @@ def _ring(
     hole: Bool[NDArray, "height width"], occupied: Bool[NDArray, "height width"]
 ) -> Bool[NDArray[np.bool_], "height width"]:
     """Some of the pixels close around a hole that no actor takes."""
-    x0, y0, x1, y1 = _bounds(hole)
+    x0, y0, x1, y1 = bounds_of_mask(hole)
     width = max(4, round(RING_SHARE * max(x1 - x0, y1 - y0)))
     reach = width + 3
     region = (

@@ -41,6 +41,7 @@ from genassets.cli.schema import schema
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.table import table
+from genassets.cli.ui import ui
 from genassets.cli.verify import verify
 from genassets.errors import EnvironmentProblem, GenAssetsError
 
@@ -87,6 +88,7 @@ app.command("resume")(resume)
 app.command("retry")(retry)
 app.command("compare")(compare)
 app.command("report")(report)
+app.command("ui")(ui)
 app.command("export")(export)
 app.command("table")(table)
 app.command("list")(list_runs)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from genassets.parquet_reading import reading_parquet
 from genassets.reporting.plot_grid import LOG_RANGE, plot_grid
 
 Curve = tuple[str, NDArray[np.int64], NDArray[np.float64]]
@@ -19,7 +20,9 @@ def read_curves(path: Path) -> list[Curve]:
     import pyarrow.parquet as pq
 
     points: dict[str, list[tuple[int, float]]] = {}
-    for row in pq.read_table(path).to_pylist():
+    with reading_parquet(path):
+        rows = pq.read_table(path).to_pylist()
+    for row in rows:
         points.setdefault(row["name"], []).append((row["step"], row["value"]))
     curves = []
     for name, pairs in sorted(points.items()):
