@@ -117,7 +117,7 @@ def test_logs_that_are_not_named_are_left_out(inputs: Inputs, tmp_path: Path) ->
 
 
 def test_generated_assets_need_a_run_that_generates(inputs: Inputs, tmp_path: Path) -> None:
-    with pytest.raises(StageError, match="this run generates none"):
+    with pytest.raises(StageError, match="this run makes none"):
         run(inputs, tmp_path / "out", assets="generated")
     both = Inputs({**inputs.objects, "generate": inputs.objects["reconstruct"]})
     assert run(both, tmp_path / "other", assets="generated")
