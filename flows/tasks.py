@@ -7,6 +7,7 @@ from typing import Any
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
+from prefect.exceptions import TerminationSignal
 
 from flows.gpu import GPU_TAG
 from genassets.errors import GenAssetsError
@@ -53,5 +54,9 @@ def run_as_task(
         retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=worth_retrying,
     )
-    as_task(step)(inputs=dict(inputs))
+    try:
+        as_task(step)(inputs=dict(inputs))
+    except TerminationSignal as signal:
+        # "Cancel" in the page, or a worker that is stopped: as Ctrl-C, so that record and MLflow are told.
+        raise KeyboardInterrupt from signal
     return outcomes[-1]

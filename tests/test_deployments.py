@@ -64,7 +64,9 @@ def test_the_form_has_every_setting_with_its_bounds_and_no_default() -> None:
     steps = definitions["GivenReconstructReconstructConfig"]["properties"]["steps"]
     assert (steps["type"], steps["exclusiveMinimum"]) == ("integer", 0)
     sections = [section for name, section in definitions.items() if name.startswith("Given")]
-    assert '"default"' not in json.dumps(sections), "a form that fills a default in would override the profile"
+    assert '"default"' not in json.dumps(sections), (
+        "a form that fills a default in would override the profile"
+    )
     assert '"null"' not in json.dumps(sections)
 
 
