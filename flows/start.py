@@ -17,6 +17,7 @@ from genassets.pipeline.atomic_write import write_text
 from genassets.pipeline.home import Home
 from genassets.pipeline.preflight import check_needs
 from genassets.pipeline.run_record import RunRecord, new_run_directory
+from genassets.tracking.address import shown_address
 
 
 def prepare_environment(home: Home) -> None:
@@ -71,12 +72,14 @@ def run_flow(request: RunRequest) -> RunRecord:
             force=list(request.force),
             accept_code=list(request.accept_code),
             retries=request.retries,
+            workers=request.workers,
+            dask=request.dask,
             return_state=True,
         )
         record = RunRecord.load(directory)
     except (RuntimeError, OSError, ValueError) as error:
         raise EnvironmentProblem(
-            f"Prefect could not run the flow: {type(error).__name__}: {error}. Its log is "
+            f"Prefect could not run the flow: {type(error).__name__}: {shown_address(str(error))}. Its log is "
             f"{workflow.home.prefect / 'prefect.log'}; the same stages run without it with --engine inline"
         ) from error
     return record

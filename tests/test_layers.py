@@ -15,7 +15,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("flows",),
     ("genassets.cli",),
     ("genassets.bench", "genassets.hard_cases"),
-    ("genassets.tracking", "genassets.reporting"),
+    ("genassets.tracking", "genassets.reporting", "genassets.workers"),
     ("genassets.pipeline",),
     ("genassets.stages",),
     ("genassets.specs",),
@@ -35,7 +35,12 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "genassets.checkpoint",
         "genassets.model_file",
     ),
-    ("genassets.package_archive", "genassets.city_spec", "genassets.system_libraries"),
+    (
+        "genassets.package_archive",
+        "genassets.parquet_reading",
+        "genassets.city_spec",
+        "genassets.system_libraries",
+    ),
     ("genassets.errors",),
 )
 LEVEL = {package: depth for depth, row in enumerate(LAYERS) for package in row}

@@ -80,7 +80,23 @@ def test_test_checks_style_and_types_before_it_runs_the_tests(checkout: Path) ->
     tools = [line.split()[2] for line in lines if line.startswith("python -m")]
     assert tools == ["ruff", "ruff", "mypy", "pytest"]
     assert lines[-1].endswith("-m not slow tests/test_weights.py")
-    assert "not slow" not in call(checkout, "test", "--all").stdout
+
+
+def test_all_tests_want_a_browser_and_go_on_without_it(checkout: Path, tmp_path: Path) -> None:
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    # A user who is not root, and a path without a browser.
+    (programs / "id").write_text("#!/bin/sh\necho 1000\n")
+    (programs / "id").chmod(0o755)
+    for name in ("sh", "cat", "cksum", "dirname"):
+        (programs / name).symlink_to(shutil.which(name) or name)
+    without = call(checkout, "test", "--all", PATH=str(programs))
+    assert "apt-get install -y chromium" in without.stderr
+    assert without.stdout.splitlines()[-1].startswith("python -m pytest")
+    assert "not slow" not in without.stdout
+    (programs / "chromium").write_text("#!/bin/sh\n")
+    (programs / "chromium").chmod(0o755)
+    assert "chromium" not in call(checkout, "test", "--all", PATH=str(programs)).stderr
 
 
 def test_a_failing_check_fails_the_command(checkout: Path) -> None:

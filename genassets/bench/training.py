@@ -18,16 +18,16 @@ LOOKS = 3
 LEVERS: Mapping[str, Mapping[str, Any]] = {
     "as in `learning`": {},
     "decoded_actors 2": {"decoded_actors": 2},
-    "decoded_actors 8": {"decoded_actors": 8},
+    "decoded_actors 4": {"decoded_actors": 4},
     "patches 8": {"patches": 8},
     "patches 32": {"patches": 32},
     "views 1": {"views": 1},
-    "views of half the size": {"patches": 8, "decoded_actors": 2},
+    "views of half the size": {"patches": 8, "decoded_actors": 4},
     "no shallow path": {"model": {"decoder_patch_channels": 0}},
     "surface term from 64 points a car": {"surface_samples": 64},
     "no total variation": {"weights": {"total_variation": 0.0}},
     "total variation 0.2": {"weights": {"total_variation": 0.2}},
-    "not mirrored": {"mirror_share": 0.0},
+    "mirrored in half the views": {"mirror_share": 0.5},
     "planes of 64 texels": {"model": {"decoder_channels": (64, 48, 32, 16)}},
 }
 """What a row differs in from the settings of `learning`; everything else, the steps too, is the same."""

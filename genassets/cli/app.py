@@ -18,7 +18,8 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 import typer
 
 from genassets import __version__
-from genassets.cli import dataset, weights
+from genassets.cli import dataset, store, weights
+from genassets.cli.augment import augment
 from genassets.cli.bench import bench
 from genassets.cli.compare import compare
 from genassets.cli.complete import complete
@@ -40,6 +41,7 @@ from genassets.cli.schema import schema
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.table import table
+from genassets.cli.ui import ui
 from genassets.cli.verify import verify
 from genassets.errors import EnvironmentProblem, GenAssetsError
 
@@ -86,6 +88,7 @@ app.command("resume")(resume)
 app.command("retry")(retry)
 app.command("compare")(compare)
 app.command("report")(report)
+app.command("ui")(ui)
 app.command("export")(export)
 app.command("table")(table)
 app.command("list")(list_runs)
@@ -96,10 +99,12 @@ app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
 app.command("generate")(generate)
+app.command("augment")(augment)
 app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)
 app.add_typer(dataset.app, name="dataset")
+app.add_typer(store.app, name="store")
 app.add_typer(weights.app, name="weights")
 
 

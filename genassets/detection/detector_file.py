@@ -35,9 +35,7 @@ def load_detector(path: Path) -> Detector:
     """
     try:
         values, tensors = read_model(path, FORMAT_VERSION)
-        settings = _Header.model_validate(values).settings
-        # Its weights are in the file: the pinned ones need not be there.
-        detector = Detector(settings.model_copy(update={"pretrained": False}))
+        detector = Detector(_Header.model_validate(values).settings)
         detector.load_state_dict(tensors)
     except (OSError, LookupError, ValueError, TypeError, RuntimeError) as error:
         raise StageError(f"{path}: no detector of this release ({error}); train it again.") from error

@@ -37,7 +37,7 @@ class DetectorTrainer:
         self.frames, self.settings, self.seed = frames, settings, seed
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.model = Detector(detector)
+            self.model = Detector(detector).start()
         backbone = [p for p in self.model.backbone.parameters() if p.requires_grad]
         taken = {id(p) for p in self.model.backbone.parameters()}
         rest = [p for p in self.model.parameters() if id(p) not in taken]

@@ -10,12 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
+from genassets.errors import DamagedFile
+from genassets.parquet_reading import reading_parquet
 from genassets.pipeline.home import Home
 from genassets.tracking.spool import Spool, SpoolState
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
     from mlflow.tracking import MlflowClient
+
+log = logging.getLogger("genassets.tracking")
 
 BATCH = 1000  # most metrics that log_batch takes at once
 PARAM_BATCH = 100
@@ -40,6 +44,8 @@ class MlflowSender:
             for name, value in {
                 "MLFLOW_DISABLE_TELEMETRY": "true",
                 "DO_NOT_TRACK": "1",
+                # It prints the whole address, with a password that is in it, between the lines of the progress.
+                "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
                 # A server that is away is found out in seconds: the spool keeps the events meanwhile.
                 "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
                 "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
@@ -141,7 +147,12 @@ class MlflowSender:
             return
         import pyarrow.parquet as pq
 
-        points = pq.read_table(path / CURVES).to_pylist()
+        try:
+            with reading_parquet(path / CURVES):
+                points = pq.read_table(path / CURVES).to_pylist()
+        except DamagedFile as error:  # what comes after it is not to wait for it for ever
+            log.warning("curves are left out: %s", error)
+            return
         named = ((clean_name(f"curves/{point['name']}"), point) for point in points)
         self._batches(
             run_id, [Metric(name, point["value"], milliseconds, point["step"]) for name, point in named]
