@@ -10,9 +10,13 @@ import cv2
 import numpy as np
 import pandas as pd
 import pytest
+from box_renderer import box_renderer
 from numpy.typing import NDArray
 from tiny_log import CAR_SIZE, PARKED, RIG, build_tiny_log
 
+from genassets.augmentation.compose import Composer
+from genassets.augmentation.compose_settings import ComposeSettings
+from genassets.augmentation.edits import Edit, PlacedAsset
 from genassets.augmentation.ground_shadow import (
     DEFAULT_STRENGTH,
     UNDER,
@@ -143,6 +147,23 @@ def test_a_wall_before_an_asset_hides_it_and_the_ground_does_not(wide: Log) -> N
     assert not static_occluders(shot, points_of(flat, flat), track, region, distance).any()
     # Seen once: something that was passing.
     assert not static_occluders(shot, points_of(left_half), track, region, distance).any()
+
+
+def test_a_wall_before_an_actor_stays_when_the_actor_goes(wide: Log) -> None:
+    """A car behind a wall is swapped and removed: the wall stays, and nothing of the asset is seen."""
+    hidden, placed = at(wide, 20.0, 0.0), replace(at(wide, 20.0, 0.0), actor_id="asset")
+    log = replace(wide, tracks=(replace(hidden, uuids=("new",)),))
+    for edit in (Edit(log.tracks[0], None), Edit(log.tracks[0], PlacedAsset(0, placed))):
+        composer = Composer(log, box_renderer(CAR_SIZE), [edit], ComposeSettings(borrow=False))
+        found = composer.compose(FRONT, 1)
+        assert found is not None and found.changed.sum() > 200
+        before = wall(12.0, (-4.0, 4.0), (0.05, 4.0))
+        composer._static = points_of(before, before)
+        found = composer.compose(FRONT, 1)
+        # Ground in sight under the wall's lowest points may still be made anew.
+        assert found is None or (
+            found.changed.sum() < 60 and not any(m.any() for m in found.visible.values())
+        )
 
 
 def test_a_surface_is_found_in_another_image(wide: Log) -> None:

@@ -154,7 +154,7 @@ class Composer:
                 again[part(own.region)] = own.outside < CONTACT_SHARE * self._settings.shadow_reach
                 shaded &= ~again[part(ground.region)]
         if shaded.any():
-            shaded &= ~nearer_actors(shot, self._kept, self._outlines, ground.region, ground.distance)
+            shaded &= ~self._before(shot, edit.removed, ground.region, ground.distance)
             hole[part(ground.region)] |= shaded
 
     def _layers(self, shot: Shot, hole: Bool[NDArray, "height width"]) -> list[Layer]:
@@ -162,13 +162,9 @@ class Composer:
         layers = []
         for placed in self._placed:
             region = layer_region(placed, shot)
-            layer = None
             if region is not None:
-                layer = self._layer(shot, placed, region, ~self._hidden(shot, placed.track, region))
-            if layer is not None and self._static is not None and self._settings.static_occlusion:
-                before = static_occluders(shot, self._static, placed.track, layer.region, layer.distance)
-                layer = replace(layer, alpha=np.where(before, np.float32(0), layer.alpha))
-            layers.append(layer)
+                open_to = ~self._hidden(shot, placed.track, region)
+                layers.append(self._layer(shot, placed, region, open_to))
         for placed in self._behind(shot, hole):
             region = layer_region(placed, shot)
             if region is not None:
@@ -194,13 +190,22 @@ class Composer:
         )
 
     def _hidden(self, shot: Shot, track: Track, region: Region) -> Bool[NDArray, "height width"]:
-        """Where in a region kept actors stand before a track's box."""
+        """Where in a region kept actors, poles and walls stand before a track's box."""
         distance = shot.box_distance(track, region)
         # Around the box itself, its middle says how far away it is.
         middle = float(np.linalg.norm(shot.camera_from_box(track)[:3, 3]))
         distance = np.where(np.isfinite(distance), distance, middle)
+        return self._before(shot, track, region, distance)
+
+    def _before(
+        self, shot: Shot, track: Track, region: Region, distance: Float[NDArray, "height width"]
+    ) -> Bool[NDArray, "height width"]:
+        """Where in a region kept actors, poles and walls stand before what of a track is at a distance."""
         kept = [other for other in self._kept if other.actor_id != track.actor_id]
-        return nearer_actors(shot, kept, self._outlines, region, distance)
+        hidden = nearer_actors(shot, kept, self._outlines, region, distance)
+        if self._static is not None and self._settings.static_occlusion:
+            hidden |= static_occluders(shot, self._static, track, region, distance)
+        return hidden
 
     def _behind(self, shot: Shot, hole: Bool[NDArray, "height width"]) -> list[PlacedAsset]:
         """Kept actors that a hole may uncover and the library has learned from this log."""
@@ -239,7 +244,7 @@ class Composer:
             if ground is None:
                 continue
             left = light_left(ground.outside, self._shadow_strength, reach)
-            hidden = nearer_actors(shot, self._kept, self._outlines, ground.region, ground.distance)
+            hidden = self._before(shot, placed.track, ground.region, ground.distance)
             light[part(ground.region)] *= np.where(hidden, np.float32(1), left)
         if (light == 1).all():
             return light < 1

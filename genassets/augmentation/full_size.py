@@ -25,14 +25,13 @@ SEEN = 1 / 512
 class Layer:
     """An asset in a region of an image. rgb is in [0, 1] and not yet multiplied by alpha.
 
-    distance: metres along the pixel's ray to its surface, infinite where there is none. depth: z of its box's centre.
+    depth: z of its box's centre in the camera, in metres.
     """
 
     actor_id: str
     region: Region
     rgb: Float[NDArray[np.float32], "height width 3"]
     alpha: Float[NDArray[np.float32], "height width"]
-    distance: Float[NDArray[np.float32], "height width"]
     depth: float
 
 
@@ -52,7 +51,7 @@ def render_layer(
     asset = renderer.assets.iloc[placed.row]
     stretch = placed.track.size / asset[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
     camera_from_box = shot.camera_from_box(placed.track)
-    # Directions come out stretched too, so that distances along rays stay those of the world.
+    # Directions come out stretched too, so that steps along rays stay metres of the world.
     box_from_camera = np.diag([*(1 / stretch), 1.0]) @ invert_pose(camera_from_box)
     window = shot.intrinsics.cropped(*region)
     scale = min(
@@ -65,14 +64,11 @@ def render_layer(
     if not (alpha > SEEN).any():
         return None
     colour = _enlarged(view.rgb, size) / np.maximum(alpha, 1e-3)[..., None]
-    solid = (view.alpha > 0.05).astype(np.float32)
-    distance = _enlarged(view.depth * solid, size) / np.maximum(_enlarged(solid, size), 1e-6)
     return Layer(
         placed.track.actor_id,
         region,
         np.clip(colour, 0, 1),
         np.where(alpha > SEEN, alpha, 0).astype(np.float32),
-        np.where((alpha > SEEN) & (distance > 0), distance, np.inf).astype(np.float32),
         float(camera_from_box[2, 3]),
     )
 

@@ -1,4 +1,4 @@
-"""Poles, walls and trees that stand before an asset, told by LiDAR points."""
+"""Poles, walls and trees that stand before an actor, told by LiDAR points."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def static_occluders(
 ) -> Bool[NDArray[np.bool_], "height width"]:
     """Pixels of a region in which something that stands still lies before what is `distance` metres along their rays.
 
-    track: the placed asset, which says what is ground.
+    track: what is behind, a placed or a removed actor, which says what is ground.
     """
     height, width = distance.shape
     hidden = np.zeros((height, width), dtype=np.uint8)
