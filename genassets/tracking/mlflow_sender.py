@@ -81,8 +81,9 @@ class MlflowSender:
         if event["event"] == "run_started":
             if state.parent is None:
                 experiment = self._experiment(event["experiment"])
-                run = client.create_run(experiment, milliseconds, event["tags"], event["run_id"])
-                state.parent = run.info.run_id
+                state.parent = self._made_before(
+                    experiment, f"tags.`genassets.run_id` = '{event['run_id']}'"
+                ) or self._create(experiment, milliseconds, event["tags"], event["run_id"])
             self._params(state.parent, event["params"])
         elif event["event"] == "stage_finished":
             assert state.parent is not None
@@ -103,8 +104,10 @@ class MlflowSender:
             experiment = client.get_run(state.parent).info.experiment_id
             started = milliseconds - int(event["seconds"] * 1000)
             tags = {"mlflow.parentRunId": state.parent, **event["tags"]}
-            child = client.create_run(experiment, started, tags, event["key"])
-            state.children[event["key"]] = child.info.run_id
+            mine = f"tags.`mlflow.parentRunId` = '{state.parent}' and attributes.run_name = '{event['key']}'"
+            state.children[event["key"]] = self._made_before(experiment, mine) or self._create(
+                experiment, started, tags, event["key"]
+            )
         run_id = state.children[event["key"]]
         self._params(run_id, event["params"])
         self._metrics(run_id, {**event["metrics"], "seconds": event["seconds"]}, milliseconds)
@@ -114,6 +117,14 @@ class MlflowSender:
             if pictures.is_dir():
                 client.log_artifacts(run_id, str(pictures), "pictures")
         client.set_terminated(run_id, _STATUS.get(event["status"], "FAILED"), milliseconds)
+
+    def _made_before(self, experiment: str, mine: str) -> str | None:
+        """The run that an earlier try made whose answer was lost."""
+        found = self.connect().search_runs([experiment], mine, max_results=1)
+        return str(found[0].info.run_id) if found else None
+
+    def _create(self, experiment: str, milliseconds: int, tags: dict[str, str], name: str) -> str:
+        return str(self.connect().create_run(experiment, milliseconds, tags, name).info.run_id)
 
     def _experiment(self, name: str) -> str:
         client = self.connect()
