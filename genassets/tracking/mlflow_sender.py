@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ from filelock import FileLock, Timeout
 from genassets.errors import DamagedFile
 from genassets.parquet_reading import reading_parquet
 from genassets.pipeline.home import Home
+from genassets.tracking.registered_models import REGISTERED
 from genassets.tracking.spool import Spool, SpoolState
 
 if TYPE_CHECKING:
@@ -23,6 +25,8 @@ log = logging.getLogger("genassets.tracking")
 
 BATCH = 1000  # most metrics that log_batch takes at once
 PARAM_BATCH = 100
+DATASET_STAGE = "ingest"
+DIGEST_LETTERS = 36  # most that MLflow takes of a dataset's digest
 _STATUS = {"completed": "FINISHED", "partly_failed": "FINISHED", "interrupted": "KILLED", "crashed": "KILLED"}
 
 
@@ -88,6 +92,8 @@ class MlflowSender:
         elif event["event"] == "stage_finished":
             assert state.parent is not None
             self._metrics(state.parent, event["metrics"], milliseconds)
+            if event["tags"].get("genassets.stage") == DATASET_STAGE and event.get("content"):
+                self._dataset(state.parent, event)
             if not event["cached"]:
                 self._child(event, state, milliseconds)
         elif event["event"] == "run_finished":
@@ -116,7 +122,38 @@ class MlflowSender:
             pictures = Path(event["path"]) / "pictures"
             if pictures.is_dir():
                 client.log_artifacts(run_id, str(pictures), "pictures")
+            self._register(event, client.get_run(state.parent).info.experiment_id, run_id)
         client.set_terminated(run_id, _STATUS.get(event["status"], "FAILED"), milliseconds)
+
+    def _dataset(self, run_id: str, event: dict[str, Any]) -> None:
+        """Say which log the run read: by name and the digest of its content."""
+        from mlflow.entities import Dataset, DatasetInput
+
+        log_name = event["tags"].get("genassets.shard", event["key"])
+        dataset = Dataset(log_name, event["content"][:DIGEST_LETTERS], "genassets log", event["path"])
+        self.connect().log_inputs(run_id, [DatasetInput(dataset)])
+
+    def _register(self, event: dict[str, Any], experiment: str, run_id: str) -> None:
+        """Make what the stage trained the newest version of the experiment's model, once."""
+        client = self.connect()
+        model = REGISTERED.get(event["tags"].get("genassets.stage", ""))
+        if model is None or event["status"] != "completed":
+            return
+        name = f"{client.get_experiment(experiment).name}-{model.name}"
+        if client.search_model_versions(f"run_id = '{run_id}'"):
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                model.write(Path(event["path"]), Path(folder))
+            except FileNotFoundError as error:  # collected since; later events are not to wait for ever
+                log.warning("no version of %s: %s", name, error)
+                return
+            client.log_artifacts(run_id, folder, "model")
+        if not client.search_registered_models(f"name = '{name}'"):
+            client.create_registered_model(name)
+        source = f"{client.get_run(run_id).info.artifact_uri}/model"
+        tags = {tag: event["tags"][tag] for tag in ("genassets.fingerprint",) if tag in event["tags"]}
+        client.create_model_version(name, source, run_id, tags)
 
     def _made_before(self, experiment: str, mine: str) -> str | None:
         """The run that an earlier try made whose answer was lost."""
