@@ -160,7 +160,9 @@ def test_logs_are_datasets_and_what_was_trained_is_a_version(tmp_path: Path) -> 
     state = sender.send(spool)
     client = sender.connect()
     assert parent is not None
-    (used,) = client.get_run(parent).inputs.dataset_inputs
+    inputs = client.get_run(parent).inputs
+    assert inputs is not None
+    (used,) = inputs.dataset_inputs
     assert (used.dataset.name, used.dataset.digest) == ("day", "ab" * 18)
     for name, stage, file in (
         ("toy-decoder", "reconstruct", "weights.safetensors"),
