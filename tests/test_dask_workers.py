@@ -262,3 +262,38 @@ def test_steps_are_prefect_tasks_on_the_dask_task_runner(tmp_path: Path) -> None
     assert answer["tasks"] == sorted([*ran, ["numbers[one]", "Failed"]])
     run_toy(tmp_path / "alone")
     assert digests(tmp_path / "alone").items() <= digests(tmp_path / "own").items()
+
+
+TINY_TRAINING = (
+    "stages=[reconstruct]",
+    "dataset.city={frames: 2, image_width: 96, image_height: 54, vehicles: 8, pedestrians: 1, supersampling: 1}",
+    "split.train_cameras=[front_camera, front_left_camera, front_right_camera, back_camera]",
+    "reconstruct={image_scale: 1.0, steps: 4, views: 2, patches: 1, patch_size: 8, lidar_rays: 16, "
+    "smallest_actor: 4, checkpoint_every: 2, weights: {perceptual: 0.0}, "
+    "model: {latent_size: 4, latent_channels: 4, decoder_channels: [8, 8], plane_channels: 4, field_hidden: 8, "
+    "features: 4, background_resolution: 16, background_plane_channels: 2, background_hidden: 8, "
+    "background_radius: 10.0, background_height: 5.0, rgb_channels: 4, rgb_blocks: 2, coarse_resolution: 8}, "
+    "rendering: {actor_step: 0.2, background_step: 4.0, background_far: 20.0, sky_samples: 2, "
+    "occupancy_cell: 2.0}}",
+)
+
+
+def test_training_in_two_processes_is_one_task(tmp_path: Path) -> None:
+    """Prefect's task on a worker has torchrun start two processes; one process inline gives the same numbers."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
+    program = "from genassets.cli.app import main; main()"
+    settings = [part for value in TINY_TRAINING for part in ("--set", value)]
+    for home, options in (
+        ("alone", ["--engine", "inline"]),
+        ("together", ["--engine", "prefect", "--workers", "1", "--set", "reconstruct.processes=2"]),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", program, "run", "demo", "--no-mlflow", *settings, *options],
+            cwd=REPOSITORY,
+            env={**kept, "GENASSETS_HOME": str(tmp_path / home), "OMP_NUM_THREADS": "1"},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr
+    assert len(digests(tmp_path / "alone")) == 2
+    assert digests(tmp_path / "together") == digests(tmp_path / "alone")

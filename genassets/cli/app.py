@@ -38,6 +38,7 @@ from genassets.cli.resume import resume
 from genassets.cli.retry import retry
 from genassets.cli.run import run
 from genassets.cli.schema import schema
+from genassets.cli.size import size
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.table import table
@@ -94,6 +95,7 @@ app.command("table")(table)
 app.command("list")(list_runs)
 app.command("verify")(verify)
 app.command("gc")(gc)
+app.command("size")(size)
 app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)

@@ -18,6 +18,8 @@ from distributed import Client, Nanny, Scheduler, Security, SpecCluster
 from distributed.diagnostics.plugin import WorkerPlugin
 
 LOOPBACK = "127.0.0.1"
+PAGES = f"{LOOPBACK}:0"
+"""Where Dask serves the pages that it serves without a dashboard too; by default on all networks."""
 SHARD, WHOLE = "shard", "whole"
 """Names of what a process offers to the scheduler, one of it: room for a step of that kind."""
 MORE_TRIES = 1  # of a step whose process was killed
@@ -43,6 +45,7 @@ class LocalWorkers:
             "protocol": "tls://",
             "security": self.security,
             "dashboard": False,
+            "dashboard_address": PAGES,
             "memory_limit": 0,  # the system's own limit holds; Dask would stop a process at its share of it
             "silence_logs": logging.CRITICAL,
         }
@@ -56,6 +59,7 @@ class LocalWorkers:
                     "protocol": "tls://",
                     "security": self.security,
                     "dashboard": False,
+                    "dashboard_address": PAGES,
                     "allowed_failures": MORE_TRIES,
                 },
             },
