@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Collection
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,7 +21,7 @@ from flows.parameters import STAGES, Settings, as_overrides
 from flows.tasks import run_as_task
 from genassets.cli.launch import RunRequest, launch, prepare, resume_request
 from genassets.cli.progress import ProgressDisplay
-from genassets.pipeline.executor import INTERRUPTED, PARTLY_FAILED
+from genassets.pipeline.executor import INTERRUPTED, PARTLY_FAILED, Workers
 from genassets.pipeline.home import Home
 from genassets.pipeline.run_record import SPEC_FILE, last_attempt
 
@@ -50,6 +53,8 @@ def experiment(
     force: list[StageName] | None = None,
     accept_code: list[StageName] | None = None,
     retries: str | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
 ) -> Any:
     """Run an experiment by the name or path of its spec.
 
@@ -67,6 +72,8 @@ def experiment(
         force: run these stages again; what hangs on them follows where their content changes.
         accept_code: take what other code made for these stages.
         retries: id of the earlier run of which nothing but the failed steps are tried again.
+        workers: do up to so many logs side by side, each in a process of its own.
+        dask: do steps on the processes of this Dask scheduler instead, such as "tcp://HOST:8786".
     """
     request = RunRequest(
         spec,
@@ -79,20 +86,33 @@ def experiment(
         tuple(force or ()),
         tuple(accept_code or ()),
         retries,
+        workers,
+        dask,
     )
     flow_run = runtime.flow_run.id
     earlier = last_attempt(Home.from_environment().runs, flow_run) if runtime.flow_run.run_count > 1 else None
     if earlier is not None and earlier.retries is None:
-        request = resume_request(earlier.run_id, "prefect", track, as_saved=True)
+        request = replace(
+            resume_request(earlier.run_id, "prefect", track, as_saved=True), workers=workers, dask=dask
+        )
     prepared = prepare(request, run_id if earlier is None else None, _command(), flow_run)
-    engine = partial(run_as_task, on_gpu=stages_on_gpu(prepared.workflow))
-    with ProgressDisplay() as display:
-        code = launch(prepared, [display, RunArtifacts()], engine)
+    on_gpu = stages_on_gpu(prepared.workflow)
+    engine = partial(run_as_task, on_gpu=on_gpu)
+    with ProgressDisplay() as display, _workers_of(request, on_gpu) as side_by_side:
+        code = launch(prepared, [display, RunArtifacts()], engine, side_by_side)
     show_results(prepared.record, prepared.workflow.home)
     message = f"run {prepared.record.run_id}: {prepared.record.error or prepared.record.status}"
     if code == INTERRUPTED:
         return Cancelled(message=message)
     return Completed(message=message) if code in (0, PARTLY_FAILED) else Failed(message=message)
+
+
+def _workers_of(request: RunRequest, on_gpu: Collection[str]) -> AbstractContextManager[Workers | None]:
+    if request.workers is None and request.dask is None:
+        return nullcontext()
+    from flows.workers import PrefectWorkers  # Dask need not be installed
+
+    return PrefectWorkers(request.workers, request.dask, on_gpu)
 
 
 def _command() -> str | None:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
+from prefect.exceptions import TerminationSignal
 
 from flows.gpu import GPU_TAG
 from genassets.errors import GenAssetsError
-from genassets.pipeline.executor import Outcome
+from genassets.pipeline.perform import Outcome
 
 RETRY_SECONDS = [2.0, 10.0]
 # A missing or forbidden file does not come back by trying again; a stale mount or a busy disk does.
@@ -36,13 +38,29 @@ def run_as_task(
     Args:
         on_gpu: stages whose tasks carry the tag "gpu", which a server can limit.
     """
-    stage = key.partition("[")[0]
     outcomes: list[Outcome] = []
 
     def step(inputs: dict[str, str]) -> str:
         outcomes.append(work())
         return outcomes[-1].stored.fingerprint
 
+    with ended_as_by_ctrl_c():
+        task_of(key, step, on_gpu)(inputs=dict(inputs))
+    return outcomes[-1]
+
+
+@contextmanager
+def ended_as_by_ctrl_c() -> Iterator[None]:
+    """Let "Cancel" in the page, or a worker that is stopped, be Ctrl-C, so that record and MLflow are told."""
+    try:
+        yield
+    except TerminationSignal as signal:
+        raise KeyboardInterrupt from signal
+
+
+def task_of(key: str, step: Callable[[dict[str, str]], Any], on_gpu: Collection[str]) -> Any:
+    """The Prefect task of a step: named by its key, uncached, tried again only where that may help."""
+    stage = key.partition("[")[0]
     as_task = task(
         name=stage,
         task_run_name=key,
@@ -53,5 +71,4 @@ def run_as_task(
         retry_delay_seconds=RETRY_SECONDS,
         retry_condition_fn=worth_retrying,
     )
-    as_task(step)(inputs=dict(inputs))
-    return outcomes[-1]
+    return as_task(step)

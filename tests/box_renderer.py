@@ -18,12 +18,22 @@ COLOUR = (1.0, 0.0, 0.5)
 
 
 class BoxRenderer:
-    def __init__(self, sizes: ArrayLike) -> None:
+    """learned: actors of the log that is composed, by their row."""
+
+    def __init__(
+        self,
+        sizes: ArrayLike,
+        colour: tuple[float, float, float] = COLOUR,
+        learned: dict[str, int] | None = None,
+    ) -> None:
         sizes = np.asarray(sizes, dtype=np.float64)
         ids = [f"asset-{row}" for row in range(len(sizes))]
+        for actor_id, row in (learned or {}).items():
+            ids[row] = actor_id
+        self.colour = colour
         self.assets = pd.DataFrame({"log": "elsewhere", "actor_id": ids, "actor_class": "Car"})
         self.assets[["size_l", "size_w", "size_h"]] = sizes
-        self.library = SimpleNamespace(indices_of_log=lambda log: {}, scenes={})
+        self.library = SimpleNamespace(indices_of_log=lambda log: learned or {}, scenes={})
         self.pixels = 0
 
     def render_actor(
@@ -40,7 +50,7 @@ class BoxRenderer:
         near, far = intersect_box(origins, directions, size.to_numpy(dtype=np.float64))
         alpha = ((near < far) & (far > 0)).astype(np.float32).reshape(height, width)
         depth = np.where(alpha > 0, np.maximum(near, 0).reshape(height, width), 0).astype(np.float32)
-        return ActorView(alpha[..., None] * np.array(COLOUR, dtype=np.float32), alpha, depth)
+        return ActorView(alpha[..., None] * np.array(self.colour, dtype=np.float32), alpha, depth)
 
 
 def box_renderer(*sizes: tuple[float, float, float]) -> SceneRenderer:

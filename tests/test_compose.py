@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
 import pytest
-from box_renderer import COLOUR, box_renderer
+from box_renderer import COLOUR, BoxRenderer, box_renderer
 from numpy.typing import NDArray
 from tiny_log import CAR_SIZE, MOVING, PARKED, RIG, build_tiny_log
 
@@ -21,6 +22,7 @@ from genassets.driving import Log, Track, open_log
 from genassets.geometry.transforms import yaw_pose
 from genassets.masks.outlines import inside_outline
 from genassets.masks.run_length import encode_mask
+from genassets.reconstruction.scene_renderer import SceneRenderer
 
 FRONT = "front_camera"
 NEW = "new"
@@ -176,6 +178,33 @@ def test_a_removed_actor_is_painted_over_with_what_is_around_it(wide: Log) -> No
     assert (np.abs(original[middle].astype(int) - 128).max(axis=1) > 20).mean() > 0.5
     assert (np.abs(found.image[middle].astype(int) - 128).max(axis=1) > 20).mean() < 0.15  # the cone is near
     assert found.visible == {}
+
+
+def test_an_actor_swapped_for_itself_looks_as_before(wide: Log) -> None:
+    """The parked car is a rectangle of grey 40 in the images, and so is the asset: what is seen of it stays."""
+    renderer = cast(SceneRenderer, BoxRenderer([CAR_SIZE], (40 / 255,) * 3))
+    swap = Edit(wide.track(PARKED), in_place_of(wide.track(PARKED)))
+    found = sure(Composer(wide, renderer, [swap], ComposeSettings()).compose(FRONT, 0))
+    original = wide.cameras[FRONT].image(0)
+    seen = found.visible[NEW]
+    assert np.abs(found.image[seen].astype(int) - original[seen]).mean() < 3  # JPEG's, and the border
+
+
+def test_an_actor_behind_a_removed_one_comes_to_light(wide: Log) -> None:
+    """A car that the library knows stands hidden behind the one that goes: it is drawn there, and only there."""
+    near = wide.track(PARKED)
+    pose = near.world_from_box.copy()
+    pose[:, 0, 3] += 8.0
+    behind = replace(near, actor_id="behind", uuids=("behind",), world_from_box=pose)
+    log = replace(wide, tracks=(near, behind))
+    renderer = cast(SceneRenderer, BoxRenderer([CAR_SIZE], learned={"behind": 0}))
+    found = sure(Composer(log, renderer, [Edit(near, None)], ComposeSettings(shadow=False)).compose(FRONT, 0))
+    uncovered = hull(log, behind) & hull(log, near)
+    assert uncovered.sum() > 100
+    drawn = np.abs(found.image.astype(int) - np.round(255 * np.array(COLOUR)).astype(int)).max(axis=-1) < 30
+    assert drawn[uncovered].mean() > 0.8
+    assert not (drawn & ~hull(log, behind)).any()
+    assert "behind" not in found.visible
 
 
 def test_a_mask_says_what_is_removed(wide: Log) -> None:

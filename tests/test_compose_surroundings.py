@@ -8,6 +8,7 @@ from typing import cast
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from tiny_log import CAR_SIZE, PARKED, RIG, build_tiny_log
@@ -19,7 +20,8 @@ from genassets.augmentation.ground_shadow import (
     light_left,
     measured_strength,
 )
-from genassets.augmentation.other_frames import OtherFrames
+from genassets.augmentation.log_colour import FEWEST, GAIN_BOUNDS, assets_colour, gain, log_colour
+from genassets.augmentation.other_frames import OtherFrames, through_ego
 from genassets.augmentation.shot import Shot
 from genassets.augmentation.static_depth import (
     PointsInView,
@@ -175,6 +177,19 @@ def test_a_surface_is_found_in_another_image(wide: Log) -> None:
     )
 
 
+def test_nothing_is_borrowed_through_the_ego_car(wide: Log) -> None:
+    """A camera above the car's middle sees over its bonnet what is far enough ahead, and nothing right before it."""
+    above = np.eye(4)
+    above[:3, 3] = 0.0, 0.0, 1.8
+    stream = wide.cameras[FRONT]
+    poses = np.tile(wide.world_from_ego[1] @ above, (3, 1, 1))
+    log = replace(wide, cameras={FRONT: replace(stream, world_from_camera=poses)})
+    ahead = transform_points(
+        log.world_from_ego[1], np.array([[3.0, 0.0, 0.0], [20.0, 0.0, 0.0], [5.0, 0.0, 3.0]])
+    )
+    np.testing.assert_array_equal(through_ego(Shot(log, FRONT, 1), ahead), [True, False, False])
+
+
 def test_a_hole_is_painted_with_what_is_around_it() -> None:
     image = np.full((300, 400, 3), 90, dtype=np.uint8)
     hole = np.zeros((300, 400), dtype=bool)
@@ -236,3 +251,32 @@ def test_the_reference_of_painting_is_opencv() -> None:
     hole[20:40, 30:50] = True
     expected = cv2.inpaint(image[12:48, 22:58], hole[12:48, 22:58].astype(np.uint8), 3, cv2.INPAINT_TELEA)
     np.testing.assert_array_equal(painted(image, hole), expected[hole[12:48, 22:58]])
+
+
+def test_brightness_of_logs_is_matched_within_bounds() -> None:
+    grey, brighter, night = np.full(3, 0.4), np.array([0.48, 0.4, 0.36]), np.full(3, 0.05)
+    np.testing.assert_allclose(gain(grey, brighter), [1.2, 1.0, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(gain(grey, night), GAIN_BOUNDS[0])
+    np.testing.assert_allclose(gain(None, grey), 1)
+
+
+def test_the_colour_of_a_library_s_log_is_that_of_its_vehicles() -> None:
+    """Lab (53.59, 0, 0) is sRGB mid-grey; pedestrians and other logs don't count, nor does a handful of cars."""
+    rows = [("a", "Car", 53.59)] * FEWEST + [("a", "Pedestrian", 90.0)] * 20 + [("b", "Car", 10.0)] * 20
+    assets = pd.DataFrame(rows, columns=["log", "actor_class", "colour_l"]).assign(colour_a=0.0, colour_b=0.0)
+    found = assets_colour(assets, "a")
+    assert found is not None
+    np.testing.assert_allclose(found, 0.5, atol=0.005)
+    assert assets_colour(assets.iloc[1:], "a") is None
+    assert assets_colour(assets.drop(columns="colour_l"), "a") is None
+
+
+def test_the_colour_of_a_log_is_that_of_its_vehicles_in_its_images(wide: Log) -> None:
+    assert log_colour(wide, [FRONT]) is None  # two cars don't tell
+    cars = tuple(
+        replace(at(wide, 13.0 + number, y), actor_id=f"{number}{y}")
+        for number in range(4)
+        for y in (-3.0, 3.0)
+    )
+    found = log_colour(replace(wide, tracks=cars), [FRONT])
+    assert found is not None and np.all((found > 0.05) & (found < 0.7))

@@ -15,7 +15,7 @@ LAYERS: tuple[tuple[str, ...], ...] = (
     ("flows",),
     ("genassets.cli",),
     ("genassets.bench", "genassets.hard_cases"),
-    ("genassets.tracking", "genassets.reporting"),
+    ("genassets.tracking", "genassets.reporting", "genassets.workers"),
     ("genassets.pipeline",),
     ("genassets.stages",),
     ("genassets.specs",),

@@ -100,7 +100,10 @@ def test_explain_compares_with_the_nearest_object(tmp_path: Path) -> None:
         explain_plan(toy_workflow(tmp_path), "totl")
 
 
-HEAVY = "numpy torch prefect mlflow open3d cv2 pandas pyarrow onnxruntime scipy matplotlib PIL skimage"
+HEAVY = (
+    "dask distributed fsspec numpy torch prefect mlflow open3d cv2 pandas pyarrow onnxruntime scipy matplotlib "
+    "PIL skimage"
+)
 
 
 @pytest.mark.parametrize(

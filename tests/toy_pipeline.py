@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.pipeline import plan
 from genassets.pipeline.catalog import configs
-from genassets.pipeline.executor import Engine, RunListener, execute, run_inline
+from genassets.pipeline.executor import Engine, RunListener, Workers, execute, run_inline
 from genassets.pipeline.home import Home
 from genassets.pipeline.plan import Selection, Workflow
 from genassets.pipeline.run_record import RunRecord, StepRecord, new_run_directory, save_spec
@@ -179,11 +179,12 @@ def run_toy(
     listeners: Sequence[RunListener] = (),
     engine: Engine = run_inline,
     stages: Sequence[Stage] = TOYS,
+    workers: Workers | None = None,
 ) -> tuple[int, RunRecord]:
     """Run the toy experiment; the exit code and the record."""
     workflow = toy_workflow(home, overrides, selection, stages=stages)
     record = start_record(workflow)
-    return execute(workflow, record, listeners, engine), record
+    return execute(workflow, record, listeners, engine, workers), record
 
 
 def states(record: RunRecord) -> dict[str, Any]:

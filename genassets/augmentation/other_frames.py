@@ -119,7 +119,7 @@ class OtherFrames:
         shown = (in_camera[:, 2] > NEAREST) & (in_camera[:, 2] < COARSER * depth)
         shown &= np.all((pixels > 1) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
         if shown.any():
-            shown &= ~_through_ego(other, points)
+            shown &= ~through_ego(other, points)
             for hull in self._hulls(other.camera, other.frame):
                 shown &= ~inside_convex(hull, pixels)
         return shown
@@ -172,7 +172,7 @@ class OtherFrames:
         return self._log.cameras[camera].image(frame)
 
 
-def _through_ego(shot: Shot, points: Float[Array, "points 3"]) -> Bool[NDArray[np.bool_], " points"]:
+def through_ego(shot: Shot, points: Float[Array, "points 3"]) -> Bool[NDArray[np.bool_], " points"]:
     """Which world points a camera would have to see through the ego car."""
     body_from_world = invert_pose(shot.log.world_from_ego[shot.frame] @ make_pose(np.eye(3), EGO_CENTRE))
     ends = transform_points(body_from_world, points)

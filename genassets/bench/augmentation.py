@@ -37,7 +37,7 @@ LARGE_VIEWS: tuple[View, ...] = (
 )
 LARGER = 4
 """480 x 270 times this is the size of PandaSet's images."""
-STEPS = 700
+STEPS = 350
 CLASSES = ("Car",)
 """Whose actors change places: as many of a kind as there are, so that every asset has a true mesh."""
 
@@ -91,7 +91,7 @@ def run(say: Callable[[str], None]) -> Sequence[Row]:
     from genassets.city_spec import CitySpec
     from genassets.driving.synthetic.synthesize import synthesize_log
 
-    spec = CitySpec(frames=12, vehicles=20, pedestrians=3)
+    spec = CitySpec(vehicles=16, pedestrians=3)
     with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:
         say("synthesizing the log")
         log_root = synthesize_log(spec, SEED, "swapped", Path(root))

@@ -18,7 +18,7 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 import typer
 
 from genassets import __version__
-from genassets.cli import dataset, weights
+from genassets.cli import dataset, store, weights
 from genassets.cli.augment import augment
 from genassets.cli.bench import bench
 from genassets.cli.compare import compare
@@ -38,6 +38,7 @@ from genassets.cli.resume import resume
 from genassets.cli.retry import retry
 from genassets.cli.run import run
 from genassets.cli.schema import schema
+from genassets.cli.size import size
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.table import table
@@ -94,6 +95,7 @@ app.command("table")(table)
 app.command("list")(list_runs)
 app.command("verify")(verify)
 app.command("gc")(gc)
+app.command("size")(size)
 app.command("schema")(schema)
 app.command("bench")(bench)
 app.command("doctor")(doctor)
@@ -104,6 +106,7 @@ app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)
 app.add_typer(dataset.app, name="dataset")
+app.add_typer(store.app, name="store")
 app.add_typer(weights.app, name="weights")
 
 

@@ -9,13 +9,21 @@ import sys
 import time
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from genassets.errors import EnvironmentProblem, GenAssetsError, SpecError, StageError
 from genassets.pipeline.catalog import CATALOG, configs
-from genassets.pipeline.executor import INTERRUPTED, Engine, RunListener, execute, run_inline
+from genassets.pipeline.executor import (
+    INTERRUPTED,
+    Engine,
+    RunListener,
+    Workers,
+    execute,
+    run_inline,
+)
 from genassets.pipeline.fingerprint import differences
 from genassets.pipeline.heartbeat import Heartbeat
 from genassets.pipeline.home import Home
@@ -45,7 +53,8 @@ class RunRequest:
     """What a person asked for: a spec by name or path, overrides, and which stages.
 
     ``resumes`` is the id of the run to go on with; its record says which stages. ``retries`` is the id of the run of
-    which nothing but the failed steps are tried again.
+    which nothing but the failed steps are tried again. ``workers`` processes, or those of the Dask scheduler at
+    ``dask``, have steps side by side.
     """
 
     spec: str
@@ -58,6 +67,8 @@ class RunRequest:
     force: tuple[str, ...] = ()
     accept_code: tuple[str, ...] = ()
     retries: str | None = None
+    workers: int | None = None
+    dask: str | None = None
 
 
 @dataclass(frozen=True)
@@ -71,6 +82,7 @@ class PreparedRun:
 
 def load_workflow(request: RunRequest) -> Workflow:
     """The workflow of a request; spec errors are raised here."""
+    check_workers(request)
     experiment = load_experiment(request.spec, configs(CATALOG), request.overrides)
     if request.start_from is not None and request.only is not None:
         raise SpecError("--from and --only contradict each other; give one of them")
@@ -166,7 +178,33 @@ def _source(request: RunRequest, runs: Path) -> tuple[str | None, tuple[str, ...
     return str(path.absolute()) if path.is_file() else request.spec, request.overrides
 
 
-def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine: Engine = run_inline) -> int:
+def workers_of(request: RunRequest) -> AbstractContextManager[Workers | None]:
+    """What a request wants steps done by, as a context; None for this process."""
+    if request.workers is None and request.dask is None:
+        return nullcontext()
+    from genassets.workers.dask_workers import DaskWorkers
+
+    return DaskWorkers(request.workers, request.dask)
+
+
+def check_workers(request: RunRequest) -> None:
+    """Refuse wishes for workers that contradict each other.
+
+    Raises:
+        SpecError
+    """
+    if request.workers is not None and request.dask is not None:
+        raise SpecError("--workers starts processes here, --dask uses those of a cluster; give one of them")
+    if request.workers is not None and request.workers < 1:
+        raise SpecError(f"--workers {request.workers}: expected 1 or more")
+
+
+def launch(
+    prepared: PreparedRun,
+    listeners: Sequence[RunListener] = (),
+    engine: Engine = run_inline,
+    workers: Workers | None = None,
+) -> int:
     """Execute a prepared run, write its report also when stages failed, and return the exit code."""
     record = prepared.record
     watching: list[RunListener] = [*listeners, ReportWriter()]
@@ -177,7 +215,7 @@ def launch(prepared: PreparedRun, listeners: Sequence[RunListener] = (), engine:
 
             watching.append(MlflowListener(prepared.workflow.home))
         with Heartbeat(record.directory):
-            return execute(prepared.workflow, record, watching, engine)
+            return execute(prepared.workflow, record, watching, engine, workers)
     except BaseException as error:
         if RunRecord.load(record.directory).status == "running":
             record.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,6 +16,15 @@ from genassets.pipeline.store import StoredObject
 # Without a terminal (a file, a continuous-integration log) a line this often replaces the moving bar.
 LINE_SECONDS = 20.0
 _MARKS = {"completed": "[green]done[/]", "failed": "[red]failed[/]", "skipped": "[yellow]skipped[/]"}
+
+
+@dataclass
+class _Shown:
+    """The bar of a step that runs, when it began, and when a line of it was last printed."""
+
+    bar: TaskID
+    started: float
+    said: float
 
 
 class ProgressDisplay:
@@ -33,9 +43,7 @@ class ProgressDisplay:
             disable=not self.console.is_terminal,
         )
         self._stages: TaskID | None = None
-        self._step: TaskID | None = None
-        self._said = 0.0
-        self._started = 0.0
+        self._steps: dict[str, _Shown] = {}
 
     def __enter__(self) -> ProgressDisplay:
         self._bars.start()
@@ -51,18 +59,18 @@ class ProgressDisplay:
 
     def step_started(self, step: StepRecord) -> None:
         """Begin the step's bar."""
-        self._drop_step()
-        self._step = self._bars.add_task(escape(step.key), total=None, message="")
-        self._started = self._said = time.monotonic()
+        now = time.monotonic()
+        bar = self._bars.add_task(escape(step.key), total=None, message="")
+        self._steps[step.key] = _Shown(bar, now, now)
 
     def step_progress(self, step: StepRecord, done: float, total: float, message: str) -> None:
         """Move the step's bar, or print a line now and then."""
-        if self._step is not None:
-            self._bars.update(self._step, completed=done, total=total, message=message)
+        shown = self._steps[step.key]
+        self._bars.update(shown.bar, completed=done, total=total, message=message)
         now = time.monotonic()
-        if not self.console.is_terminal and now - self._said >= LINE_SECONDS and done > 0:
-            self._said = now
-            left = (now - self._started) * (total - done) / done
+        if not self.console.is_terminal and now - shown.said >= LINE_SECONDS and done > 0:
+            shown.said = now
+            left = (now - shown.started) * (total - done) / done
             self.console.print(
                 f"  {escape(step.key)} {done:g}/{total:g}, about {left:.0f} s left {escape(message)}",
                 soft_wrap=True,
@@ -70,7 +78,8 @@ class ProgressDisplay:
 
     def step_finished(self, step: StepRecord, stored: StoredObject | None) -> None:
         """Print what became of the step."""
-        self._drop_step()
+        if step.key in self._steps:  # not of a step that was skipped
+            self._bars.remove_task(self._steps.pop(step.key).bar)
         mark = (
             "[blue]accepted[/]"
             if step.accepted
@@ -92,8 +101,3 @@ class ProgressDisplay:
         self.console.print(f"[bold]{record.status}[/] after {seconds:.1f} s", soft_wrap=True)
         if record.report:
             self.console.print(f"report: {record.report}", soft_wrap=True)
-
-    def _drop_step(self) -> None:
-        if self._step is not None:
-            self._bars.remove_task(self._step)
-            self._step = None

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import typer
 
-from genassets.cli.run import AcceptCode, AsJson, EngineName, Track, run_request
+from genassets.cli.run import (
+    AcceptCode,
+    AsJson,
+    DaskAddress,
+    EngineName,
+    Track,
+    WorkerCount,
+    run_request,
+)
 
 
 def resume(
@@ -16,6 +25,8 @@ def resume(
     ] = False,
     accept_code: AcceptCode = None,
     engine: EngineName = "prefect",
+    workers: WorkerCount = None,
+    dask: DaskAddress = None,
     as_json: AsJson = False,
     track: Track = True,
 ) -> None:
@@ -28,4 +39,5 @@ def resume(
     from genassets.tracking.dead_runs import settle_dead_runs
 
     settle_dead_runs(Home.from_environment())
-    run_request(resume_request(run, engine, track, tuple(accept_code or ()), as_saved), as_json)
+    request = resume_request(run, engine, track, tuple(accept_code or ()), as_saved)
+    run_request(replace(request, workers=workers, dask=dask), as_json)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import typer
 
-from genassets.cli.run import AsJson, EngineName, Track, run_request
+from genassets.cli.run import AsJson, DaskAddress, EngineName, Track, WorkerCount, run_request
 
 
 def retry(
     run: Annotated[str | None, typer.Argument(help="Run id or its start; the newest by default.")] = None,
     engine: EngineName = "prefect",
+    workers: WorkerCount = None,
+    dask: DaskAddress = None,
     as_json: AsJson = False,
     track: Track = True,
 ) -> None:
@@ -24,4 +27,5 @@ def retry(
     from genassets.tracking.dead_runs import settle_dead_runs
 
     settle_dead_runs(Home.from_environment())
-    run_request(retry_request(run, engine, track), as_json)
+    request = replace(retry_request(run, engine, track), workers=workers, dask=dask)
+    run_request(request, as_json)

@@ -38,6 +38,21 @@ Force = Annotated[
 ]
 Track = Annotated[bool, typer.Option("--mlflow/--no-mlflow", help="Record the run in MLflow.")]
 
+WorkerCount = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", metavar="N", help="Do up to N logs side by side, each in a process of its own."
+    ),
+]
+DaskAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--dask",
+        metavar="ADDRESS",
+        help="Do steps on the processes of this Dask scheduler (tcp://HOST:PORT), which share GENASSETS_HOME.",
+    ),
+]
+
 
 def run(
     spec: Spec = "demo",
@@ -51,6 +66,8 @@ def run(
     force: Force = None,
     accept_code: AcceptCode = None,
     engine: EngineName = "prefect",
+    workers: WorkerCount = None,
+    dask: DaskAddress = None,
     as_json: AsJson = False,
     track: Track = True,
 ) -> None:
@@ -66,6 +83,8 @@ def run(
         track,
         force=tuple(force or ()),
         accept_code=tuple(accept_code or ()),
+        workers=workers,
+        dask=dask,
     )
     run_request(request, as_json)
 
@@ -87,12 +106,12 @@ def run_request(request: RunRequest, as_json: bool) -> None:
 
 
 def _run_inline(request: RunRequest) -> RunRecord:
-    from genassets.cli.launch import launch, prepare
+    from genassets.cli.launch import launch, prepare, workers_of
     from genassets.cli.progress import ProgressDisplay
 
     prepared = prepare(request)
-    with ProgressDisplay() as display:
-        launch(prepared, [display])
+    with ProgressDisplay() as display, workers_of(request) as workers:
+        launch(prepared, [display], workers=workers)
     return prepared.record
 
 

@@ -1,26 +1,27 @@
-"""Walks a workflow: every step from the store, or made under its lock and put there whole."""
+"""Walks a workflow step by step, or gives steps to workers, and keeps the run's record true."""
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Any, Protocol
 
 from genassets.errors import CodeChanged, GenAssetsError, StageError
 from genassets.pipeline.fingerprint import fingerprint
-from genassets.pipeline.plan import Step, Workflow, code_twin, reason_to_make, reason_to_run
+from genassets.pipeline.parcel import Done, Parcel, arrived, fingerprints, keys_of
+from genassets.pipeline.perform import Outcome, perform, wanted_tree
+from genassets.pipeline.plan import Step, Workflow
 from genassets.pipeline.run_record import METRICS_FILE, RunRecord, StepRecord, read_metrics, write_metrics
-from genassets.pipeline.store import CURVES, METRICS, StoredObject
-from genassets.stages.stage import Inputs, Metric, StageContext
+from genassets.pipeline.store import METRICS, StoredObject
 
 log = logging.getLogger("genassets.executor")
 
-CURVE_POINTS = "_curves.jsonl"  # in the work directory, so that a resumed stage keeps its earlier points
 INTERRUPTED = 130
 PARTLY_FAILED = 4
 
@@ -39,16 +40,38 @@ class RunListener(Protocol):
     def run_finished(self, record: RunRecord) -> None: ...
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a step gave: its object, and whether the store had it."""
-
-    stored: StoredObject
-    cached: bool
-
-
 # Runs a step's work under the step's key with the fingerprints of its inputs; Prefect makes a task of it.
 Engine = Callable[[str, Mapping[str, str], Callable[[], Outcome]], Outcome]
+
+
+@dataclass(frozen=True)
+class Word:
+    """What the workers say of a step: one of ``parcel.Say``, or "ended" with a Done or an exception."""
+
+    key: str
+    kind: str
+    values: tuple[Any, ...]
+
+
+class Workers(Protocol):
+    """Processes that work on several steps at a time."""
+
+    @property
+    def at_once(self) -> int:
+        """How many steps they take, those that wait for a free process included."""
+        ...
+
+    def start(self, parcel: Parcel, inputs: Mapping[str, str]) -> None:
+        """Take a step; ``inputs`` are as an engine gets them. Whatever becomes of it is a word."""
+        ...
+
+    def next_word(self) -> Word:
+        """Wait for the next word on any step."""
+        ...
+
+    def stop(self) -> None:
+        """End all work at once."""
+        ...
 
 
 def run_inline(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome]) -> Outcome:
@@ -56,149 +79,28 @@ def run_inline(key: str, inputs: Mapping[str, str], work: Callable[[], Outcome])
     return work()
 
 
-def wanted_tree(
-    workflow: Workflow, step: Step, inputs: Mapping[str, Mapping[str, StoredObject]]
-) -> dict[str, Any]:
-    """The component tree of the object that a step wants, given the objects that it reads by stage and shard."""
-    contents = {
-        stage: {s: stored.content for s, stored in shards.items()} for stage, shards in inputs.items()
-    }
-    return workflow.tree(step, contents)
-
-
-def perform(
-    workflow: Workflow,
-    step: Step,
-    tree: Mapping[str, Any],
-    inputs: Mapping[str, Mapping[str, StoredObject]],
-    on_progress: Callable[[float, float, str], None],
-    on_reason: Callable[[str], None],
-) -> Outcome:
-    """Find a step's object in the store or make it.
-
-    Args:
-        tree: as by ``wanted_tree``.
-        inputs: the objects that the step reads, by stage and shard.
-        on_reason: told why the object has to be made before that begins.
-
-    Raises:
-        CodeChanged: the stage's source is no longer what the fingerprint says; nothing is stored.
-        GenAssetsError: the stage, the lock or the disk failed.
-    """
-    store = workflow.store
-    name = step.stage.name
-    digest = fingerprint(tree)
-    found = store.find(name, digest)
-    if found is not None and not step.forced:
-        return Outcome(found, cached=True)
-    with store.lock(name, digest):
-        found = store.find(name, digest)
-        if found is not None and not step.forced:
-            return Outcome(found, cached=True)
-        workflow.check_code(step)
-        if found is None and name in workflow.selection.accept_code:
-            return Outcome(_accepted(workflow, step, tree), cached=True)
-        on_reason(reason_to_make(store, step, tree, found is not None))
-        if step.forced and step.key not in workflow.selection.begun:
-            store.clear_work(name, digest)
-        with store.creating(name, digest) as out:
-            work_dir = store.work_dir(name, digest)
-            curves = _Curves(work_dir / CURVE_POINTS)
-            context = StageContext(
-                seed=workflow.experiment.header.seed,
-                shard=step.shard,
-                work_dir=work_dir,
-                on_progress=on_progress,
-                on_curve=curves.add,
-            )
-            paths = {
-                stage: {s: stored.path for s, stored in shards.items()} for stage, shards in inputs.items()
-            }
-            config = workflow.experiment.config(name, step.shard)
-            started = time.monotonic()
-            metrics = step.stage.run(Inputs(paths, workflow.borrowed(step)), config, out, context)
-            seconds = time.monotonic() - started
-            try:
-                workflow.check_code(step)
-            except CodeChanged:
-                store.clear_work(name, digest)  # its checkpoints may be of the edited code
-                raise
-            _write_results(step, out, metrics, curves)
-            made = store.commit(out, name, step.shard, digest, tree, seconds, step.stage.location_files)
-        store.clear_work(name, digest)
-    return Outcome(made, cached=False)
-
-
-def _accepted(workflow: Workflow, step: Step, tree: Mapping[str, Any]) -> StoredObject:
-    """What other code made of the same inputs and settings, put under the step's own fingerprint."""
-    twin = code_twin(workflow.store, tree)
-    if twin is None:
-        raise StageError(
-            f"--accept-code {step.stage.name}: of {step.key} the store has nothing that differs by code alone "
-            f"({reason_to_run(workflow.store, tree)}); run without it"
-        )
-    stored, changed = twin
-    modules = [field.removeprefix("code/") for field, _, _ in changed]
-    log.warning("%s: %s taken though its code changed: %s", step.key, stored.path, ", ".join(modules))
-    return workflow.store.adopt(stored, fingerprint(tree), tree, step.stage.location_files, modules)
-
-
-class _Curves:
-    """Points of a stage's curves; a point given again replaces the earlier one (a resumed stage repeats some)."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.points: dict[tuple[str, int], float] = {}
-        if path.is_file():
-            for line in path.read_text(encoding="utf-8").splitlines():
-                try:
-                    name, step, value = json.loads(line)
-                except ValueError:
-                    break  # the line being written when the process was killed
-                self.points[name, step] = value
-
-    def add(self, name: str, step: int, value: float) -> None:
-        self.points[name, step] = value
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps([name, step, value]) + "\n")
-
-
-def _write_results(step: Step, out: Path, metrics: Sequence[Metric], curves: _Curves) -> None:
-    if not isinstance(metrics, list) or not all(isinstance(metric, Metric) for metric in metrics):
-        raise StageError(f"stage {step.key} returned {type(metrics).__name__}; expected a list of Metric")
-    if metrics:
-        write_metrics(out / METRICS, [metric.row() for metric in metrics], with_stage=False)
-    if curves.points:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-        ordered = sorted(curves.points.items())
-        columns: dict[str, list[Any]] = {
-            "name": [name for (name, _), _ in ordered],
-            "step": [at for (_, at), _ in ordered],
-            "value": [value for _, value in ordered],
-        }
-        schema = pa.schema([("name", pa.string()), ("step", pa.int64()), ("value", pa.float64())])
-        pq.write_table(pa.table(columns, schema=schema), out / CURVES)
-
-
 def execute(
-    workflow: Workflow, record: RunRecord, listeners: Sequence[RunListener], engine: Engine = run_inline
+    workflow: Workflow,
+    record: RunRecord,
+    listeners: Sequence[RunListener],
+    engine: Engine = run_inline,
+    workers: Workers | None = None,
 ) -> int:
     """Run every step in order and keep the record true; returns the exit code.
 
     A failed step lets steps that don't read it go on. Ctrl-C stops at once, with nothing half written, and
-    so does a change of the code.
+    so does a change of the code. With ``workers`` each step is theirs as soon as what it reads is there; what the store
+    has is still found here, through the engine.
     """
     workflow.pin_code()
     run = _Run(workflow, record, listeners, engine)
     for listener in listeners:
         listener.run_started(record, workflow)
     try:
-        for step in workflow.steps():
-            run.step(step)
-            if run.code_changed:
-                break
+        if workers is not None:
+            run.side_by_side(workers)
+        else:
+            run.one_by_one()
     except KeyboardInterrupt:
         record.status = "interrupted"
         record.error = "interrupted by the user"
@@ -213,6 +115,25 @@ def execute(
     return record.exit_code
 
 
+@dataclass(frozen=True)
+class _Begun:
+    """A step whose inputs are there, and when it began."""
+
+    step: Step
+    record: StepRecord
+    inputs: Mapping[str, Mapping[str, StoredObject]]
+    started: float
+
+    @property
+    def fingerprints(self) -> dict[str, str]:
+        """Of the inputs, by the keys of the steps that made them."""
+        return {
+            f"{stage}[{shard}]" if shard else stage: stored.fingerprint
+            for stage, shards in self.inputs.items()
+            for shard, stored in shards.items()
+        }
+
+
 class _Run:
     def __init__(
         self, workflow: Workflow, record: RunRecord, listeners: Sequence[RunListener], engine: Engine
@@ -222,68 +143,206 @@ class _Run:
         self._listeners = listeners
         self._engine = engine
         self._done: dict[str, StoredObject] = {}
-        self._codes: list[int] = []
+        self._codes: dict[str, int] = {}
+        self._away: dict[str, _Begun] = {}
+        """Steps that are with the workers, by key."""
         self.code_changed = False
 
-    def step(self, step: Step) -> None:
-        """Run one step and record what became of it."""
+    def one_by_one(self) -> None:
+        """Run all steps, each after the one before."""
+        for step in self._workflow.steps():
+            begun = self._begin(step)
+            if begun is not None:
+                self._run(begun, self._work_of(begun))
+            if self.code_changed:
+                break
+
+    def side_by_side(self, workers: Workers) -> None:
+        """Run all steps, each as soon as what it reads is settled; the workers have few at a time."""
+        steps = {step.key: step for step in self._workflow.steps()}
+        order = TopologicalSorter(keys_of(steps.values(), self._workflow))
+        order.prepare()
+        ready: deque[str] = deque()
+        try:
+            while order.is_active() and not self.code_changed:
+                ready.extend(order.get_ready())
+                while ready and len(self._away) < workers.at_once and not self.code_changed:
+                    key = ready.popleft()
+                    if not self._send(steps[key], workers):
+                        order.done(key)
+                        ready.extend(order.get_ready())
+                if self._away and not self.code_changed:
+                    order.done(*self._hear(workers))
+            while self._away:
+                self._hear(workers)
+        except KeyboardInterrupt:
+            workers.stop()
+            for begun in list(self._away.values()):
+                self._interrupted(begun)
+            raise
+
+    def _send(self, step: Step, workers: Workers) -> bool:
+        """Give a step to the workers; False where it was settled here."""
+        begun = self._begin(step, told=False)
+        if begun is None:
+            return False
+        try:
+            tree = self._tree_of(begun)
+            found = self._workflow.store.find(step.stage.name, fingerprint(tree))
+        except Exception as error:
+            self._failed(begun, error)
+            return False
+        if self._workflow.selection.leaves_alone(step) or (found is not None and not step.forced):
+            self._tell_started(begun)
+            self._run(begun, self._work_of(begun))
+            return False
+        self._away[step.key] = begun
+        parcel = Parcel(
+            self._record.run_id,
+            self._workflow.experiment,
+            self._workflow.catalog,
+            self._workflow.home.root,
+            self._workflow.selection,
+            self._workflow.borrowed_outputs,
+            step.key,
+            tree,
+            fingerprints(begun.inputs),
+        )
+        workers.start(parcel, begun.fingerprints)
+        return True
+
+    def _hear(self, workers: Workers) -> list[str]:
+        """Wait for the next word of the workers; the key of the step that it settles."""
+        word = workers.next_word()
+        begun = self._away.get(word.key)
+        if begun is None:
+            return []  # progress that came after the end
+        if word.kind == "log":
+            name, level, text = word.values
+            logging.getLogger(name).log(level, "%s: %s", word.key, text)
+            return []
+        if begun.record.status == "pending":
+            begun = self._away[word.key] = replace(begun, started=time.monotonic())
+            self._tell_started(begun)
+        if word.kind == "started":
+            log.info("%s: begun by %s", word.key, *word.values)
+        elif word.kind == "progress":
+            self._progress_of(begun)(*word.values)
+        elif word.kind == "reason":
+            self._reason_of(begun)(*word.values)
+        else:
+            del self._away[word.key]
+            self._settle(begun, word.values[0])
+            return [word.key]
+        return []
+
+    def _settle(self, begun: _Begun, end: Done | Exception) -> None:
+        if isinstance(end, Exception):
+            self._failed(begun, end)
+            return
+        begun.record.reason = end.reason
+        try:
+            stored = arrived(self._workflow.store, begun.step.stage.name, end.fingerprint)
+        except GenAssetsError as error:
+            self._failed(begun, error)
+            return
+        self._completed(begun, Outcome(stored, end.cached))
+
+    def _begin(self, step: Step, told: bool = True) -> _Begun | None:
+        """A step whose inputs are there, or None for one that is skipped. ``told``: listeners hear that it runs."""
         record = self._record.step(step.key)
         inputs, missing = self._inputs(step)
+        begun = _Begun(step, record, inputs, time.monotonic())
         if missing:
             record.status = "skipped"
             record.error = f"needs {', '.join(missing)}"
             self._finished(record, None)
-            return
-        record.status = "running"
+            return None
+        if told:
+            self._tell_started(begun)
+        return begun
+
+    def _tell_started(self, begun: _Begun) -> None:
+        begun.record.status = "running"
         self._record.save()
         for listener in self._listeners:
-            listener.step_started(record)
+            listener.step_started(begun.record)
 
+    def _tree_of(self, begun: _Begun) -> dict[str, Any]:
+        tree = wanted_tree(self._workflow, begun.step, begun.inputs)
+        begun.record.fingerprint = fingerprint(tree)
+        self._record.save()  # before the object is looked for: what a run is at is not collected
+        return tree
+
+    def _progress_of(self, begun: _Begun) -> Callable[[float, float, str], None]:
         def on_progress(done: float, total: float, message: str) -> None:
             for listener in self._listeners:
-                listener.step_progress(record, done, total, message)
+                listener.step_progress(begun.record, done, total, message)
 
+        return on_progress
+
+    def _reason_of(self, begun: _Begun) -> Callable[[str], None]:
         def on_reason(reason: str) -> None:
-            record.reason = reason
+            begun.record.reason = reason
             self._record.save()
 
-        def work() -> Outcome:
-            tree = wanted_tree(self._workflow, step, inputs)
-            record.fingerprint = fingerprint(tree)
-            self._record.save()  # before the object is looked for: what a run is at is not collected
-            if self._workflow.selection.leaves_alone(step):
-                return self._from_store(step, record.fingerprint)
-            return perform(self._workflow, step, tree, inputs, on_progress, on_reason)
+        return on_reason
 
-        started = time.monotonic()
-        fingerprints = {
-            f"{stage}[{shard}]" if shard else stage: stored.fingerprint
-            for stage, shards in inputs.items()
-            for shard, stored in shards.items()
-        }
+    def _work_of(self, begun: _Begun) -> Callable[[], Outcome]:
+        def work() -> Outcome:
+            tree = self._tree_of(begun)
+            if self._workflow.selection.leaves_alone(begun.step):
+                return self._from_store(begun.step, fingerprint(tree))
+            return perform(
+                self._workflow,
+                begun.step,
+                tree,
+                begun.inputs,
+                self._progress_of(begun),
+                self._reason_of(begun),
+            )
+
+        return work
+
+    def _run(self, begun: _Begun, work: Callable[[], Outcome]) -> None:
+        """Do a step's work in this process and record what became of it."""
         try:
-            outcome = self._engine(step.key, fingerprints, work)
+            outcome = self._engine(begun.step.key, begun.fingerprints, work)
         except KeyboardInterrupt:
-            record.status = "interrupted"
-            record.seconds = time.monotonic() - started
-            self._finished(record, None)
+            self._interrupted(begun)
             raise
         except Exception as error:
-            known = isinstance(error, GenAssetsError)
-            self.code_changed = isinstance(error, CodeChanged)
-            record.status = "failed"
-            record.error = str(error) if known else f"{type(error).__name__}: {error}"
-            record.seconds = time.monotonic() - started
-            self._codes.append(error.exit_code if isinstance(error, GenAssetsError) else StageError.exit_code)
-            log.error("stage %s failed: %s", step.key, record.error, exc_info=error)
-            self._finished(record, None)
-            return
+            self._failed(begun, error)
+        else:
+            self._completed(begun, outcome)
+
+    def _interrupted(self, begun: _Begun) -> None:
+        if begun.record.status == "running":
+            begun.record.status = "interrupted"
+            begun.record.seconds = time.monotonic() - begun.started
+            self._finished(begun.record, None)
+
+    def _failed(self, begun: _Begun, error: Exception) -> None:
+        known = isinstance(error, GenAssetsError)
+        record = begun.record
+        self.code_changed = self.code_changed or isinstance(error, CodeChanged)
+        record.status = "failed"
+        record.error = str(error) if known else f"{type(error).__name__}: {error}"
+        record.seconds = time.monotonic() - begun.started
+        self._codes[record.key] = (
+            error.exit_code if isinstance(error, GenAssetsError) else StageError.exit_code
+        )
+        log.error("stage %s failed: %s", record.key, record.error, exc_info=error)
+        self._finished(record, None)
+
+    def _completed(self, begun: _Begun, outcome: Outcome) -> None:
+        record = begun.record
         record.status = "completed"
         record.cached = outcome.cached
         record.accepted = (outcome.stored.accepted or {}).get("fingerprint")
         record.path = str(outcome.stored.path)
         record.seconds = 0.0 if outcome.cached else outcome.stored.seconds
-        self._done[step.key] = outcome.stored
+        self._done[record.key] = outcome.stored
         self._finished(record, outcome.stored)
 
     def _from_store(self, step: Step, digest: str) -> Outcome:
@@ -341,7 +400,8 @@ class _Run:
             return INTERRUPTED
         if self._record.status == "partly_failed":
             return PARTLY_FAILED
-        return self._codes[0] if self._codes else StageError.exit_code
+        first = next((step.key for step in self._record.stages if step.key in self._codes), None)
+        return StageError.exit_code if first is None else self._codes[first]
 
 
 def run_metrics(record: RunRecord) -> list[dict[str, Any]]:

@@ -87,15 +87,22 @@ class Workflow:
     """The steps of an experiment, and the fingerprint of each once its inputs are there."""
 
     def __init__(
-        self, experiment: Experiment, catalog: Iterable[Stage], home: Home, selection: Selection = Selection()
+        self,
+        experiment: Experiment,
+        catalog: Iterable[Stage],
+        home: Home,
+        selection: Selection = Selection(),
+        borrowed: Mapping[Borrowed, tuple[Path, str]] | None = None,
     ) -> None:
+        """``borrowed`` are outputs of other runs that were found already, as ``borrowed_outputs`` has them."""
         self.experiment = experiment
+        self.catalog = tuple(catalog)
         self.home = home
         self.store = Store(home.store)
         self.selection = selection
-        self.stages = self._selected(tuple(catalog))
+        self.stages = self._selected(self.catalog)
         self._logs: dict[str, str] = {}
-        self._borrowed: dict[Borrowed, tuple[Path, str]] = {}
+        self._borrowed = dict(borrowed or {})
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
         selection = self.selection
@@ -236,6 +243,11 @@ class Workflow:
         """
         config = self.experiment.config(step.stage.name, step.shard)
         return {borrowed.stage: self._borrow(borrowed)[0] for borrowed in step.stage.borrows(config)}
+
+    @property
+    def borrowed_outputs(self) -> Mapping[Borrowed, tuple[Path, str]]:
+        """Directory and content digest of the outputs of other runs that were asked for so far."""
+        return dict(self._borrowed)
 
     def _borrow(self, borrowed: Borrowed) -> tuple[Path, str]:
         """Directory and content digest of another run's output: the same as long as this workflow lives."""

@@ -20,6 +20,7 @@ from typing import Any
 from genassets.errors import EnvironmentProblem, LockedError, StageError
 from genassets.pipeline.atomic_write import sync_directory
 from genassets.pipeline.file_digests import sha256_of
+from genassets.pipeline.fingerprint import fingerprint as fingerprint_of
 
 MANIFEST = "_MANIFEST.json"
 METRICS = "metrics.parquet"
@@ -217,7 +218,6 @@ class Store:
 
         ``location_files`` are left out of the content digest.
         """
-        final = self.path_of(stage, fingerprint)
         with _disk_errors_named(self.root):
             files: dict[str, dict[str, Any]] = {}
             for path in sorted(temporary.rglob("*")):
@@ -238,16 +238,39 @@ class Store:
                 "components": components,
                 "accepted": accepted,
             }
-            target = temporary / MANIFEST
-            target.write_text(json.dumps(manifest, indent=1, sort_keys=True) + "\n", encoding="utf-8")
-            _sync_file(target)
-            for folder in [path for path in temporary.rglob("*") if path.is_dir()]:
-                sync_directory(folder)
-            sync_directory(temporary)
-            if final.exists():  # a forced rerun, or an object that was found damaged
-                final.rename(final.parent / f".old-{fingerprint}-{os.getpid()}")
-            temporary.rename(final)
-            sync_directory(final.parent)
+            text = json.dumps(manifest, indent=1, sort_keys=True) + "\n"
+            return self._appear(temporary, self.path_of(stage, fingerprint), text)
+
+    def receive(self, temporary: Path, manifest: str) -> StoredObject:
+        """Put an object of another store into place, whose files lie in a temporary directory; see ``creating``.
+
+        Raises:
+            StageError: the manifest is not that of the directory's files and of its own fingerprint.
+        """
+        (temporary / MANIFEST).write_text(manifest, encoding="utf-8")
+        sent = _read_manifest(temporary)
+        if sent is None or fingerprint_of(sent.components) != sent.fingerprint:
+            raise StageError("its manifest is damaged: it is not that of an object of this fingerprint")
+        if problems := self.verify(sent):
+            raise StageError(f"it is damaged: {problems[0]}")
+        with _disk_errors_named(self.root):
+            for name in sent.files:
+                _sync_file(temporary / name)
+            return self._appear(temporary, self.path_of(sent.stage, sent.fingerprint), manifest)
+
+    @staticmethod
+    def _appear(temporary: Path, final: Path, manifest: str) -> StoredObject:
+        """Write the manifest beside files that are synced, sync the directories, and rename the whole."""
+        target = temporary / MANIFEST
+        target.write_text(manifest, encoding="utf-8")
+        _sync_file(target)
+        for folder in [path for path in temporary.rglob("*") if path.is_dir()]:
+            sync_directory(folder)
+        sync_directory(temporary)
+        if final.exists():  # a forced rerun, or an object that was found damaged
+            final.rename(final.parent / f".old-{final.name}-{os.getpid()}")
+        temporary.rename(final)
+        sync_directory(final.parent)
         stored = _read_manifest(final)
         assert stored is not None
         return stored

@@ -84,6 +84,7 @@ class MlflowListener:
             cached=step.cached,
             seconds=step.seconds,
             path=step.path,
+            content=stored.content if stored is not None else None,
             tags={name: value for name, value in tags.items() if value},
             params=dict(flat_params(self._resolved.get(step.name, {}))),
             metrics=named_metrics(rows),
