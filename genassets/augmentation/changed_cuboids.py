@@ -77,7 +77,7 @@ def _in_place_of(row: Mapping[str, Any], removed: Track, placed: Track, frame: i
         for name, value in row.items()
         if same_class or name == MOTION or not str(name).startswith(OF_ONE_KIND)
     }
-    sibling = str(row.get("cuboids.sibling_id", "-"))
+    sibling = row.get("cuboids.sibling_id")
     return {
         **dict.fromkeys(row, np.nan),
         **kept,
@@ -88,7 +88,7 @@ def _in_place_of(row: Mapping[str, Any], removed: Track, placed: Track, frame: i
         "position.y": float(row["position.y"] + moved[1]),
         "position.z": float(new[2, 3]),
         **_dimensions(placed),
-        **({"cuboids.sibling_id": names.get(sibling, sibling)} if "cuboids.sibling_id" in row else {}),
+        **({"cuboids.sibling_id": names.get(str(sibling), sibling)} if "cuboids.sibling_id" in row else {}),
     }
 
 
