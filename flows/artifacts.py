@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+import httpx
 from prefect.artifacts import (
     create_image_artifact,
     create_link_artifact,
@@ -36,7 +37,10 @@ log = logging.getLogger("genassets.artifacts")
 MLFLOW_PAGE_VARIABLE = "GENASSETS_MLFLOW_PAGE"
 PROGRESS_SECONDS = 5.0  # between two updates: each is a request to the server
 METRIC_ROWS = 500
+AWAY_SECONDS = 300.0  # how long a server that was away is not asked
 LARGEST_PICTURE = 640  # pixels of the longer side; a picture is stored in Prefect's database
+
+_away_until = [0.0]  # in the clock of time.monotonic
 
 
 class RunArtifacts:
@@ -51,8 +55,10 @@ class RunArtifacts:
         """Show what is planned, and a bar at zero."""
         self._steps = len(record.stages)
         with _no_failure("plan"):
+            _ask()
             create_table_artifact(_plan_rows(workflow), key=_key(record, "plan"), description=record.run_id)
         with _no_failure("progress"):
+            _ask()
             made = create_progress_artifact(0.0, key=_key(record, "progress"), description=record.run_id)
             assert isinstance(made, UUID)
             self._progress = made
@@ -78,25 +84,39 @@ class RunArtifacts:
             return
         self._told = time.monotonic()
         with _no_failure("progress"):
+            _ask()
             update_progress_artifact(self._progress, 100.0 * (self._finished + part) / max(self._steps, 1))
 
 
 def show_results(record: RunRecord, home: Home) -> None:
     """Show metrics, a picture a stage and the link to the report of a run that has ended."""
     with _no_failure("metrics"):
+        _ask()
         rows = _metric_rows(record)
         if rows:
             create_table_artifact(rows, key=_key(record, "metrics"), description=record.run_id)
     for step in record.stages:
         with _no_failure("picture"):
+            _ask()
             shown = _first_picture(step)
             if shown is not None:
                 picture, title = shown
                 create_image_artifact(picture, key=_key(record, step.key), description=title)
     with _no_failure("report"):
+        _ask()
         link = _report_link(record, home)
         if link is not None:
             create_link_artifact(link, "report", key=_key(record, "report"), description=f"`{record.report}`")
+
+
+class _StillAway(Exception):
+    """The server was away a moment ago."""
+
+
+def _ask() -> None:
+    """Before a request: raise _StillAway where the last one found no server, for each waits long for one."""
+    if time.monotonic() < _away_until[0]:
+        raise _StillAway
 
 
 @contextmanager
@@ -104,7 +124,11 @@ def _no_failure(what: str) -> Iterator[None]:
     """What Prefect shows never decides what becomes of a run."""
     try:
         yield
+    except _StillAway:
+        log.info("Prefect is away: it was not told the %s", what)
     except Exception as error:
+        if isinstance(error, httpx.TransportError):
+            _away_until[0] = time.monotonic() + AWAY_SECONDS
         log.warning("Prefect did not take the %s: %s", what, error, exc_info=error)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 from prefect import flow, runtime
@@ -22,14 +23,20 @@ from genassets.cli.launch import RunRequest, launch, prepare, resume_request
 from genassets.cli.progress import ProgressDisplay
 from genassets.pipeline.executor import INTERRUPTED, PARTLY_FAILED, Workers
 from genassets.pipeline.home import Home
-from genassets.pipeline.run_record import last_attempt
+from genassets.pipeline.run_record import SPEC_FILE, last_attempt
 
 StageName = Annotated[str, Field(json_schema_extra={"enum": STAGES})]
 
 
+def _name_of_run() -> str:
+    """The experiment's name or that of its file; of a run that goes on with another, that one's."""
+    path = Path(runtime.flow_run.parameters["spec"])
+    return path.parent.name if path.name == SPEC_FILE else path.stem
+
+
 @flow(
     name="experiment",
-    flow_run_name="{spec}",
+    flow_run_name=_name_of_run,
     persist_result=False,
     on_failure=[tell_webhook],
     on_crashed=[tell_webhook],

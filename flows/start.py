@@ -16,7 +16,8 @@ from genassets.errors import EnvironmentProblem
 from genassets.pipeline.atomic_write import write_text
 from genassets.pipeline.home import Home
 from genassets.pipeline.preflight import check_needs
-from genassets.pipeline.run_record import RunRecord, new_run_directory
+from genassets.pipeline.run_record import RUN_FILE, RunRecord, new_run_directory
+from genassets.tracking.address import shown_address
 
 
 def prepare_environment(home: Home) -> None:
@@ -35,6 +36,8 @@ def prepare_environment(home: Home) -> None:
         "PREFECT_HOME": str(home.prefect),
         "PREFECT_LOGGING_SETTINGS_PATH": str(logging_file),
         "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "120",
+        # Waits of 2, 4 and 8 seconds: with Prefect's five each request to a server that is gone waits a minute.
+        "PREFECT_CLIENT_MAX_RETRIES": "3",
     }
     for name, value in settings.items():
         os.environ.setdefault(name, value)
@@ -57,6 +60,8 @@ def run_flow(request: RunRequest) -> RunRecord:
         file=sys.stderr,
         flush=True,
     )
+    import httpx
+
     from flows.experiment import experiment
 
     try:
@@ -76,12 +81,37 @@ def run_flow(request: RunRequest) -> RunRecord:
             return_state=True,
         )
         record = RunRecord.load(directory)
+    except httpx.TransportError as error:
+        record = _record_without_server(directory, error)
     except (RuntimeError, OSError, ValueError) as error:
         raise EnvironmentProblem(
-            f"Prefect could not run the flow: {type(error).__name__}: {error}. Its log is "
+            f"Prefect could not run the flow: {type(error).__name__}: {shown_address(str(error))}. Its log is "
             f"{workflow.home.prefect / 'prefect.log'}; the same stages run without it with --engine inline"
         ) from error
     return record
+
+
+def _record_without_server(directory: Path, error: Exception) -> RunRecord:
+    """The record of a run whose server went away: its stages went on without it, so their result counts.
+
+    Raises:
+        EnvironmentProblem: the run had not ended.
+    """
+    address = shown_address(os.environ.get("PREFECT_API_URL", "its local address"))
+    gone = f"Prefect's server at {address} cannot be reached ({shown_address(str(error))})"
+    if (directory / RUN_FILE).is_file():
+        record = RunRecord.load(directory)
+        if record.exit_code is not None:
+            print(
+                f"genassets: {gone}, so its pages lack the end of run {record.run_id}, which is {record.status}; "
+                "nothing of the run is lost",
+                file=sys.stderr,
+            )
+            return record
+    raise EnvironmentProblem(
+        f"{gone}; start it again and give the same command, which goes on where this one stopped, or run without "
+        "it: --engine inline"
+    ) from error
 
 
 def _logging(file: Path) -> dict[str, object]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from prefect import task
 from prefect.cache_policies import NO_CACHE
+from prefect.exceptions import TerminationSignal
 
 from flows.gpu import GPU_TAG
 from genassets.errors import GenAssetsError
@@ -42,8 +44,18 @@ def run_as_task(
         outcomes.append(work())
         return outcomes[-1].stored.fingerprint
 
-    task_of(key, step, on_gpu)(inputs=dict(inputs))
+    with ended_as_by_ctrl_c():
+        task_of(key, step, on_gpu)(inputs=dict(inputs))
     return outcomes[-1]
+
+
+@contextmanager
+def ended_as_by_ctrl_c() -> Iterator[None]:
+    """Let "Cancel" in the page, or a worker that is stopped, be Ctrl-C, so that record and MLflow are told."""
+    try:
+        yield
+    except TerminationSignal as signal:
+        raise KeyboardInterrupt from signal
 
 
 def task_of(key: str, step: Callable[[dict[str, str]], Any], on_gpu: Collection[str]) -> Any:

@@ -10,7 +10,8 @@ from distributed import Client
 from prefect.client.orchestration import get_client
 from prefect_dask import DaskTaskRunner
 
-from flows.tasks import task_of
+from flows.tasks import ended_as_by_ctrl_c, task_of
+from genassets.pipeline.executor import Word
 from genassets.pipeline.parcel import Done, Parcel
 from genassets.workers.dask_workers import DaskWorkers, do_parcel
 
@@ -32,6 +33,10 @@ class PrefectWorkers(DaskWorkers):
                 self._runner.__exit__(kind, error, trace)
         finally:
             super().__exit__(kind, error, trace)
+
+    def next_word(self) -> Word:
+        with ended_as_by_ctrl_c():
+            return super().next_word()
 
     def _submit(self, client: Client, parcel: Parcel, inputs: Mapping[str, str]) -> Any:
         if self._runner is None:

@@ -26,6 +26,10 @@ class StageError(GenAssetsError):
     exit_code = 3
 
 
+class DamagedFile(StageError):
+    """A file that an earlier stage or run wrote is no longer whole."""
+
+
 class CodeChanged(StageError):
     """The source was edited while a run was going, so what it makes would be of no one version."""
 

@@ -78,7 +78,7 @@ class Page:
 
 @contextmanager
 def browser(profile: Path, width: int = 1280, height: int = 860) -> Iterator[Page]:
-    """A page of a headless Chromium; the test is skipped where there is none."""
+    """A page of a headless Chromium that reaches this machine alone; the test is skipped where there is none."""
     program = next((found for name in NAMES if (found := shutil.which(name))), None)
     if program is None:
         pytest.skip(f"no browser ({', '.join(NAMES)}): apt-get install chromium")
@@ -86,7 +86,7 @@ def browser(profile: Path, width: int = 1280, height: int = 860) -> Iterator[Pag
         "--headless=new", "--no-sandbox", "--remote-debugging-port=0", f"--user-data-dir={profile}",
         "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage", "--hide-scrollbars",
         "--no-first-run", "--disable-extensions", "--disable-background-networking", "--disable-sync",
-        "--host-resolver-rules=MAP * ~NOTFOUND", f"--window-size={width},{height}", "about:blank",
+        "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1", f"--window-size={width},{height}", "about:blank",
     )  # fmt: skip
     with subprocess.Popen(
         [program, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL

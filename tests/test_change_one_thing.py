@@ -121,8 +121,9 @@ def other_values(value: Any, words: list[str], made: Made) -> list[Any]:
     if isinstance(value, float):
         return [value * 0.5, value * 2, value + 0.1]
     if isinstance(value, list):
-        return [value[:-1], [*value, *value[-1:]], [item * 2 for item in value], ["left_camera"]]
-    return [*words, str(made.library.parent), 1, 0.5, str(made.library / "weights")]
+        edits = [[{"actor": "a", "degrees": 1.0}], [{"x": 1.0, "y": 1.0}]]
+        return [value[:-1], [*value, *value[-1:]], [item * 2 for item in value], ["left_camera"], *edits]
+    return [*words, str(made.library.parent), 1, 0.5, str(made.library / "weights"), ["Car"]]
 
 
 def changed_section(made: Made, stage: str, at: At) -> dict[str, Any] | None:

@@ -24,12 +24,12 @@ SCRIPT = """
     prepare_environment(Home(home))
     from prefect import flow
     from prefect.client.orchestration import get_client
-    from prefect.exceptions import MissingResult
+    from prefect.exceptions import TerminationSignal
     from flows.tasks import run_as_task
     from genassets.errors import StageError
     from tests.toy_pipeline import run_toy, states
 
-    tries = {"busy": 0, "wrong": 0, "absent": 0}
+    tries = {"busy": 0, "wrong": 0, "absent": 0, "stopped": 0}
 
     def broken(kind, error):
         def work():
@@ -51,10 +51,10 @@ SCRIPT = """
         import flows.tasks
         flows.tasks.RETRY_SECONDS = [0, 0]
         for kind, error in (("busy", TimeoutError("slow disk")), ("wrong", ValueError("bad number")),
-                            ("absent", FileNotFoundError("no file"))):
+                            ("absent", FileNotFoundError("no file")), ("stopped", TerminationSignal(15))):
             try:
                 run_as_task(kind, {}, broken(kind, error))
-            except Exception as caught:
+            except BaseException as caught:
                 seen[kind] = type(caught).__name__
         return seen
 
@@ -81,9 +81,11 @@ def test_flow_through_prefect(tmp_path: Path) -> None:
     answer = json.loads(done.stdout.strip().splitlines()[-1])
     keys = ["numbers[one]", "numbers[two]", "total", "report"]
     assert answer["results"] == [[0, dict.fromkeys(keys, "completed")], [0, dict.fromkeys(keys, "cached")]]
-    assert answer["tasks"] == sorted([*keys, *keys, "absent", "busy", "wrong"])
-    assert answer["seen"] == {"busy": "TimeoutError", "wrong": "ValueError", "absent": "FileNotFoundError"}
-    assert answer["tries"] == {"busy": 3, "wrong": 1, "absent": 1}, "only what may pass is tried again"
+    assert answer["tasks"] == sorted([*keys, *keys, "absent", "busy", "stopped", "wrong"])
+    seen = {"busy": "TimeoutError", "wrong": "ValueError", "absent": "FileNotFoundError"}
+    assert answer["seen"] == {**seen, "stopped": "KeyboardInterrupt"}, "a cancelled run ends as by Ctrl-C"
+    tries = {"busy": 3, "wrong": 1, "absent": 1, "stopped": 1}
+    assert answer["tries"] == tries, "only what may pass is tried again"
     assert (tmp_path / "prefect/prefect.log").is_file()
     assert "prefect" not in done.stderr.lower(), "its logs go to the file"
 

@@ -35,7 +35,12 @@ LAYERS: tuple[tuple[str, ...], ...] = (
         "genassets.checkpoint",
         "genassets.model_file",
     ),
-    ("genassets.package_archive", "genassets.city_spec", "genassets.system_libraries"),
+    (
+        "genassets.package_archive",
+        "genassets.parquet_reading",
+        "genassets.city_spec",
+        "genassets.system_libraries",
+    ),
     ("genassets.errors",),
 )
 LEVEL = {package: depth for depth, row in enumerate(LAYERS) for package in row}

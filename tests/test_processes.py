@@ -97,21 +97,21 @@ def outcome(job: Job) -> Outcome:
 
 def test_what_is_sent_comes_back_as_it_was() -> None:
     rows = torch.sparse_coo_tensor(torch.tensor([[4, 1, 4]]), torch.rand(3, 2), (6, 2), check_invariants=True)
-    thing = Thing(
-        "a", torch.rand(3, 5).half().T, (None, rows, torch.tensor(True), torch.zeros(0, 2), torch.tensor(7))
-    )
+    part = torch.rand(3, 5).half().T
+    several = (None, rows, torch.tensor(True), torch.zeros(0, 2), torch.tensor(7))
+    thing = {"name": "a", "part": part, "several": several}
     taken = _TakenApart.of([thing, 2.5])
     sent = torch.cat([*taken.parts, torch.zeros(9, dtype=torch.uint8)])
     assert taken.size == len(sent) - 9
     back, number = _put_together(taken.rest, sent)
-    assert (back.name, number) == ("a", 2.5)
-    assert back.part.dtype == torch.float16 and torch.equal(back.part, thing.part)
-    assert back.part.stride() == thing.part.stride()
-    none, sparse, *others = back.several
+    assert (back["name"], number) == ("a", 2.5)
+    assert back["part"].dtype == torch.float16 and torch.equal(back["part"], part)
+    assert back["part"].stride() == part.stride()
+    none, sparse, *others = back["several"]
     assert none is None
     assert not sparse.is_coalesced() and torch.equal(sparse._indices(), rows._indices())
     assert torch.equal(sparse.to_dense(), rows.to_dense())
-    for sent_one, other in zip(thing.several[2:], others, strict=True):
+    for sent_one, other in zip(several[2:], others, strict=True):
         assert sent_one is not None and sent_one.dtype == other.dtype and torch.equal(sent_one, other)
 
 

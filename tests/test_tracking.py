@@ -6,7 +6,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from safetensors.numpy import load_file, save_file
 
 from genassets.pipeline.executor import run_metrics
 from genassets.pipeline.home import Home
@@ -118,3 +120,55 @@ def test_sending_goes_on_where_it_stopped(tmp_path: Path, monkeypatch: pytest.Mo
     experiment = client.get_experiment_by_name("toy")
     assert experiment is not None
     assert len(client.search_runs([experiment.experiment_id])) == 5
+
+
+@pytest.mark.slow
+def test_logs_are_datasets_and_what_was_trained_is_a_version(tmp_path: Path) -> None:
+    """A decoder without its logs' backgrounds, a prior; sent twice, each is there once."""
+    output = tmp_path / "output"
+    output.mkdir()
+    weights = {"decoder.head.weight": np.ones(3, np.float32), "backgrounds.0": np.zeros(9, np.float32)}
+    save_file(weights, output / "weights.safetensors")
+    save_file({"head": np.ones(2, np.float32)}, output / "prior.safetensors")
+    (output / "config.json").write_text("{}")
+    spool = Spool(tmp_path / "run")
+    common = {
+        "status": "completed",
+        "cached": False,
+        "seconds": 1.0,
+        "path": str(output),
+        "content": "ab" * 32,
+    }
+    spool.append(
+        {"event": "run_started", "time": 1.0, "run_id": "r", "experiment": "toy", "tags": {}, "params": {}}
+    )
+    for stage, shard in (("ingest", "day"), ("reconstruct", None), ("train_prior", None)):
+        tags = {"genassets.stage": stage, "genassets.fingerprint": "f"}
+        tags |= {"genassets.shard": shard} if shard else {}
+        event = {
+            "event": "stage_finished",
+            "time": 2.0,
+            "key": stage,
+            "tags": tags,
+            "params": {},
+            "metrics": {},
+        }
+        spool.append({**event, **common})
+    sender = MlflowSender(Home(tmp_path))
+    parent = sender.send(spool).parent
+    spool.save(SpoolState(sent=0, parent=parent))
+    state = sender.send(spool)
+    client = sender.connect()
+    assert parent is not None
+    (used,) = client.get_run(parent).inputs.dataset_inputs
+    assert (used.dataset.name, used.dataset.digest) == ("day", "ab" * 18)
+    for name, stage, file in (
+        ("toy-decoder", "reconstruct", "weights.safetensors"),
+        ("toy-prior", "train_prior", "prior.safetensors"),
+    ):
+        (version,) = client.search_model_versions(f"name = '{name}'")
+        assert version.run_id == state.children[stage]
+        assert version.tags == {"genassets.fingerprint": "f"}
+        there = client.download_artifacts(version.run_id, "model", str(tmp_path))
+        kept = load_file(Path(there) / file)
+        assert list(kept) == (["decoder.head.weight"] if stage == "reconstruct" else ["head"])

@@ -24,6 +24,7 @@ def benchmarks() -> tuple[Benchmark, ...]:
     """Every benchmark, in the order of the table. Modules import heavy libraries inside ``run``."""
     from genassets.bench import (
         adaptation_start,
+        augmentation,
         frechet,
         learning,
         masks,
@@ -44,4 +45,5 @@ def benchmarks() -> tuple[Benchmark, ...]:
         training.BENCHMARK,
         training_memory.BENCHMARK,
         frechet.BENCHMARK,
+        augmentation.BENCHMARK,
     )

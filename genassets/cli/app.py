@@ -19,6 +19,7 @@ import typer
 
 from genassets import __version__
 from genassets.cli import dataset, store, weights
+from genassets.cli.augment import augment
 from genassets.cli.bench import bench
 from genassets.cli.compare import compare
 from genassets.cli.complete import complete
@@ -41,6 +42,7 @@ from genassets.cli.size import size
 from genassets.cli.speed_error import speed_error
 from genassets.cli.status import status
 from genassets.cli.table import table
+from genassets.cli.ui import ui
 from genassets.cli.verify import verify
 from genassets.errors import EnvironmentProblem, GenAssetsError
 
@@ -87,6 +89,7 @@ app.command("resume")(resume)
 app.command("retry")(retry)
 app.command("compare")(compare)
 app.command("report")(report)
+app.command("ui")(ui)
 app.command("export")(export)
 app.command("table")(table)
 app.command("list")(list_runs)
@@ -98,6 +101,7 @@ app.command("bench")(bench)
 app.command("doctor")(doctor)
 app.command("hard-cases")(hard_cases)
 app.command("generate")(generate)
+app.command("augment")(augment)
 app.command("speed-error")(speed_error)
 app.command("complete")(complete)
 app.command("inspect")(inspect)

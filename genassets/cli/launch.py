@@ -14,9 +14,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from genassets.errors import GenAssetsError, SpecError
+from genassets.errors import EnvironmentProblem, GenAssetsError, SpecError, StageError
 from genassets.pipeline.catalog import CATALOG, configs
-from genassets.pipeline.executor import Engine, RunListener, Workers, execute, run_inline
+from genassets.pipeline.executor import (
+    INTERRUPTED,
+    Engine,
+    RunListener,
+    Workers,
+    execute,
+    run_inline,
+)
 from genassets.pipeline.fingerprint import differences
 from genassets.pipeline.heartbeat import Heartbeat
 from genassets.pipeline.home import Home
@@ -33,6 +40,7 @@ from genassets.pipeline.run_record import (
 from genassets.pipeline.store import StoredObject
 from genassets.specs.document import read_document
 from genassets.specs.experiment import Experiment, load_experiment
+from genassets.tracking.address import shown_address
 from genassets.tracking.dead_runs import settle_dead_runs
 
 log = logging.getLogger("genassets.launch")
@@ -209,8 +217,9 @@ def launch(
         with Heartbeat(record.directory):
             return execute(prepared.workflow, record, watching, engine, workers)
     except BaseException as error:
-        if record.status == "running":
+        if RunRecord.load(record.directory).status == "running":
             record.status = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+            record.exit_code = _exit_code(error)
             record.error = str(error) or type(error).__name__
             record.finished = time.time()
             record.save()
@@ -219,6 +228,15 @@ def launch(
     finally:
         logging.getLogger("genassets").removeHandler(handler)
         handler.close()
+
+
+def _exit_code(error: BaseException) -> int:
+    """What the command ends with for an error that stopped the run itself, not one of its stages."""
+    if isinstance(error, KeyboardInterrupt):
+        return INTERRUPTED
+    if isinstance(error, GenAssetsError):
+        return error.exit_code
+    return EnvironmentProblem.exit_code if isinstance(error, OSError) else StageError.exit_code
 
 
 class ReportWriter:
@@ -331,9 +349,16 @@ def _fields_that_differ(before: Mapping[str, Any], after: Mapping[str, Any]) -> 
     )
 
 
+class _WithoutPasswords(logging.Formatter):
+    """Lines and tracebacks, in which MLflow and Prefect quote addresses as they were given."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return shown_address(super().format(record))
+
+
 def _log_to(path: Path) -> logging.Handler:
     handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler.setFormatter(_WithoutPasswords("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("genassets")
     logger.addHandler(handler)
     logger.setLevel(os.environ.get("GENASSETS_LOG_LEVEL", "INFO"))

@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from genassets.masks.run_length import decode_mask
+from genassets.parquet_reading import reading_parquet
 
 Array = NDArray[np.float64]
 
@@ -94,9 +95,11 @@ def read_object_table(path: Path) -> pd.DataFrame:
     """Read an object table; integer and boolean columns that may be null come as pandas' nullable types.
 
     Raises:
-        ValueError: the file's columns are not those of OBJECT_SCHEMA.
+        DamagedFile: the file is not whole.
+        ValueError: its columns are not those of OBJECT_SCHEMA.
     """
-    table = pq.read_table(path)
+    with reading_parquet(path):
+        table = pq.read_table(path)
     missing = [field.name for field in OBJECT_SCHEMA if field.name not in table.column_names]
     if missing:
         raise ValueError(f"{path}: columns {missing} are missing; expected an object table of prepare_masks")

@@ -96,6 +96,11 @@ class DetectionFrames:
 
     def _image(self, camera: Mapping[str, Any], token: str) -> NDArray[np.uint8]:
         path = self.folder / str(camera["data_path"])
+        if not path.resolve().is_relative_to(self.folder.resolve()):
+            raise DatasetError(
+                f"{path}: the image of frame {token} lies outside the set {self.folder}; expected a path from its "
+                "folder. Take the set from a source that you trust."
+            )
         if not path.is_file():
             raise DatasetError(
                 f"{path}: the image of frame {token} is missing; copy the set as a whole folder."

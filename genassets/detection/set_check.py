@@ -233,7 +233,12 @@ def _check_frame(
     for path, kind in ((camera["data_path"], "image"), (entry["lidar_path"], "sweep")):
         problems += _check_path(where, place.folder, path, kind, listed)
     sweep = place.folder / entry["lidar_path"]
-    if not malformed and sweep.is_file() and sweep.stat().st_size % POINT_BYTES == 0:
+    if (
+        not malformed
+        and not _leads_out(entry["lidar_path"])
+        and sweep.is_file()
+        and sweep.stat().st_size % POINT_BYTES == 0
+    ):
         problems += _check_counts(where, sweep, entry, rows)
     if other is None:
         return problems
@@ -246,10 +251,14 @@ def _check_frame(
     return problems
 
 
+def _leads_out(path: str) -> bool:
+    pure = PurePosixPath(path)
+    return pure.is_absolute() or ".." in pure.parts or "\\" in path
+
+
 def _check_path(where: str, folder: Path, path: str, kind: str, listed: set[str]) -> Iterator[str]:
     """A path from the set's folder to a file in it that the set lists."""
-    pure = PurePosixPath(path)
-    if pure.is_absolute() or ".." in pure.parts or "\\" in path:
+    if _leads_out(path):
         yield f"{where}: its {kind}'s path '{path}' leads out of the set; expected one from its folder. {AGAIN}."
     elif not (folder / path).is_file():
         yield f"{folder / path}: no such {kind}, and {where} names it. Copy the folder again, whole."
@@ -261,7 +270,7 @@ def _check_path(where: str, folder: Path, path: str, kind: str, listed: set[str]
 
 def _check_image(place: Place, path: str, image: Mapping[str, Any]) -> Iterator[str]:
     """That an image decodes whole and has the size that v2 says."""
-    if not (place.folder / path).is_file():
+    if _leads_out(path) or not (place.folder / path).is_file():
         return  # named with its path
     try:
         height, width = read_image(place.folder / path).shape[:2]

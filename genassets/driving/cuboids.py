@@ -7,6 +7,7 @@ saw has two cuboids (twins, sensor_id 0 and 1) which name each other in sibling_
 
 from __future__ import annotations
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ SPIN_SECONDS = 0.1  # the spinning LiDAR turns at 10 Hz
 SIZE_QUANTILE = 0.9
 
 _NUMBERS = ("yaw", "position.x", "position.y", "position.z", "dimensions.x", "dimensions.y", "dimensions.z")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,127}")
 _REQUIRED = ("uuid", "label", "stationary", *_NUMBERS)
 
 
@@ -88,6 +90,11 @@ def read_cuboids(path: Path, frame: int) -> tuple[list[Cuboid], Counter[str]]:
                     f"{path}: row {row} ({label} {uuid}), '{column}' is {number}; expected a side above 0 m. "
                     "Correct the annotation or remove the row."
                 )
+        if not _NAME.fullmatch(str(uuid)):
+            raise LogError(
+                f"{path}: row {row}, uuid {str(uuid)[:80]!r} is no id; expected letters, digits and - _ . : alone, for "
+                "files are named after it. Correct the annotation or remove the row."
+            )
         if uuid in seen:
             raise LogError(
                 f"{path}: row {row}, uuid '{uuid}' appears twice; expected one cuboid an actor and frame."

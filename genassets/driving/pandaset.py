@@ -171,6 +171,12 @@ def _frame_files(
     return tuple(files)
 
 
+def cuboid_files(root: Path, frame_count: int) -> tuple[Path | None, ...]:
+    """The file of each frame's boxes, None where it is missing."""
+    folder = root / "annotations" / "cuboids"
+    return _frame_files(folder, (".pkl.gz", ".pkl"), frame_count, "cuboids", [])
+
+
 def _read_camera(folder: Path, start_time: float, frame_count: int, missing: list[str]) -> CameraStream:
     path = folder / "intrinsics.json"
     fx, fy, cx, cy = _fields(path, "intrinsics", _read_json(path), ("fx", "fy", "cx", "cy"))
@@ -212,9 +218,11 @@ def _read_tracks(
         missing.append("annotations/cuboids: no such directory; the log has no actors")
         return [], dropped
     cuboids = []
-    paths = _frame_files(folder, (".pkl.gz", ".pkl"), len(frame_times), "cuboids", missing)
+    paths = cuboid_files(root, len(frame_times))
     for frame, path in enumerate(paths):
-        if path is not None:
+        if path is None:
+            missing.append(f"annotations/cuboids: frame {frame} has no cuboids")
+        else:
             of_frame, others = read_cuboids(path, frame)
             cuboids += of_frame
             dropped += others

@@ -41,8 +41,11 @@ class Sweep:
     world_from_lidar: NDArray[np.float64]
 
 
-def read_sweep(path: Path, start_time: float, world_from_lidar: NDArray[np.float64]) -> Sweep:
-    """Read `lidar/NN.pkl[.gz]`; raises LogError where a column is missing or a number is not finite."""
+def read_returns(path: Path) -> dict[str, NDArray[np.float64]]:
+    """The columns of `lidar/NN.pkl[.gz]` as they are, by name (COLUMNS); times in unix seconds.
+
+    Raises LogError where a column is missing or a number is not finite.
+    """
     table = read_table(path)
     for column in COLUMNS:
         if column not in table.columns:
@@ -64,6 +67,12 @@ def read_sweep(path: Path, start_time: float, world_from_lidar: NDArray[np.float
                 f"{path}: column '{column}', row {bad[0]} is not finite ({len(bad)} such rows); expected "
                 "numbers. Download the file again or leave it out (missing sweeps are skipped)."
             )
+    return numbers
+
+
+def read_sweep(path: Path, start_time: float, world_from_lidar: NDArray[np.float64]) -> Sweep:
+    """Read `lidar/NN.pkl[.gz]`, without the ego car's own returns; errors as in read_returns."""
+    numbers = read_returns(path)
     points = np.stack([numbers["x"], numbers["y"], numbers["z"]], axis=1)
     in_lidar = transform_points(invert_pose(world_from_lidar), points)
     keep = np.any(np.abs(in_lidar) > EGO_HALF_EXTENT, axis=1)

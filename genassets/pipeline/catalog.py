@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable, Mapping
 from pydantic import BaseModel
 
 from genassets.stages import (
+    augment,
     evaluate_completion,
     evaluate_detector,
     evaluate_generation,
@@ -42,6 +43,7 @@ CATALOG: tuple[Stage, ...] = (
     evaluate_sampling.STAGE,
     evaluate_completion.STAGE,
     evaluate_speed_error.STAGE,
+    augment.STAGE,
     write_dataset.STAGE,
     train_detector.STAGE,
     evaluate_detector.STAGE,

@@ -163,7 +163,7 @@ class Workflow:
             stage = by_name[name]
             if not stage.sharded:
                 needed[name] = {"": name}
-            elif step.stage.sharded:
+            elif step.stage.sharded and name not in step.stage.whole_inputs:
                 assert step.shard is not None
                 needed[name] = {step.shard: f"{name}[{step.shard}]"}
             else:

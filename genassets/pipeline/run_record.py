@@ -7,16 +7,20 @@ import json
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from genassets.errors import SpecError, StageError
+from genassets.errors import EnvironmentProblem, SpecError, StageError
+from genassets.parquet_reading import reading_parquet
 from genassets.pipeline.atomic_write import write_json, write_text
 from genassets.pipeline.heartbeat import is_silent, last_sign
 from genassets.pipeline.process_mark import ProcessMark
 
+STAMP = "%Y%m%d-%H%M%S"
+"""Date and time at the start of a run's id, in local time."""
 RUN_FILE = "run.json"
 SPEC_FILE = "spec.yaml"
 METRICS_FILE = "metrics.parquet"
@@ -136,16 +140,39 @@ class RunRecord:
 
 
 def new_run_directory(runs: Path, experiment: str) -> Path:
-    """Make runs/<run_id> with an id of date, time and experiment that does not exist yet."""
-    stamp = time.strftime("%Y%m%d-%H%M%S")
+    """Make runs/<run_id> with an id of date, time and experiment that does not exist yet and sorts behind all others.
+
+    After a clock was set back it takes the second after the newest run's, so that the newest run is the last one made.
+    """
+    stamp = _stamp(time.time())
+    newest = max((path.name[: len(stamp)] for path in list_runs(runs)), default="")
+    if newest > stamp:
+        stamp = _second_after(newest) or stamp
     for attempt in range(1000):
         directory = runs / (f"{stamp}-{experiment}" + (f"-{attempt + 1}" if attempt else ""))
         try:
             directory.mkdir(parents=True)
         except FileExistsError:
             continue
+        except OSError as error:
+            raise EnvironmentProblem(
+                f"{directory}: cannot be made ({error.strerror}); set GENASSETS_HOME to a directory that this user may "
+                "write"
+            ) from error
         return directory
     raise RuntimeError(f"{runs}: no free name for a run of {experiment} at {stamp}")
+
+
+def _stamp(seconds: float) -> str:
+    return time.strftime(STAMP, time.localtime(seconds))
+
+
+def _second_after(stamp: str) -> str | None:
+    """The next stamp; None for what a run was renamed to."""
+    try:
+        return (datetime.strptime(stamp, STAMP) + timedelta(seconds=1)).strftime(STAMP)
+    except ValueError:
+        return None
 
 
 def save_spec(directory: Path, resolved: dict[str, Any]) -> None:
@@ -201,11 +228,12 @@ def write_metrics(path: Path, rows: Iterable[dict[str, Any]], with_stage: bool) 
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """Rows of a metrics table, [] where there is none."""
+    """Rows of a metrics table, [] where there is none; DamagedFile where it is not whole."""
     if not path.is_file():
         return []
     import pyarrow.parquet as pq
 
-    with pq.ParquetFile(path) as file:  # read_table would import pandas, which takes as long as all the rest
+    # read_table would import pandas, which takes as long as all the rest.
+    with reading_parquet(path), pq.ParquetFile(path) as file:
         rows: list[dict[str, Any]] = file.read().to_pylist()
     return rows

@@ -14,7 +14,7 @@ import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from genassets.errors import EnvironmentProblem, LockedError, StageError
@@ -162,20 +162,25 @@ class Store:
 
         Raises:
             LockedError: another process held it for longer than ``wait_seconds``.
+            EnvironmentProblem: the store cannot be written.
         """
         from filelock import FileLock, Timeout  # plan and status take no lock
 
         path = self._lock_file(stage, fingerprint)
-        with _disk_errors_named(self.root):
-            path.parent.mkdir(parents=True, exist_ok=True)
+        held = FileLock(path, timeout=wait_seconds)
         try:
-            with FileLock(path, timeout=wait_seconds):
-                yield
+            with _disk_errors_named(self.root):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                held.acquire()
         except Timeout as error:
             raise LockedError(
                 f"{path}: another process is making this object of {stage} and did not finish within "
                 f"{wait_seconds:g} s; wait for it, or end that process"
             ) from error
+        try:
+            yield
+        finally:
+            held.release()
 
     def _lock_file(self, stage: str, fingerprint: str) -> Path:
         return self.root / "locks" / f"{stage}-{fingerprint}.lock"
@@ -335,6 +340,11 @@ def content_digest(files: Mapping[str, Mapping[str, Any]]) -> str:
 def _read_manifest(path: Path) -> StoredObject | None:
     try:
         manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        if any(
+            PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts
+            for name in manifest["files"]
+        ):
+            return None  # not written here: files of an object lie in its directory
         return StoredObject(
             stage=manifest["stage"],
             shard=manifest["shard"],

@@ -1,7 +1,7 @@
 """The asset library on disk: what a reconstruction leaves for evaluation, generation and augmentation.
 
 assets.parquet       a row an actor: log, actor_id, actor_class, size_l, size_w, size_h, observations, and
-                     colour_l, colour_a, colour_b, which libraries of earlier versions lack
+                     time_of_day, colour_l, colour_a, colour_b, which libraries of earlier versions lack
 latents.safetensors  mean and log_variance (actors, channels, size, size), in the order of the table; of a model without
                      decoder the planes alone, as mean (actors, 3 x channels, height, width)
 weights.safetensors  decoder, fields, shadow head, image network, class embeddings, backgrounds, occupancy

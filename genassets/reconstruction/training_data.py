@@ -129,8 +129,8 @@ def prepare_training(
     """The table of learnable actors and, for each log, its views, sweeps and occupancy.
 
     An actor is learnable once it is observed: a training view shows it with at least `smallest_actor` pixels and
-    nearer boxes don't hide it whole. Columns: log, actor_id, actor_class, size_l, size_w, size_h (metres),
-    observations.
+    nearer boxes don't hide it whole. Columns: log, time_of_day, actor_id, actor_class, size_l, size_w, size_h
+    (metres), observations.
 
     With a directory, each log is written there, an image and a sweep at a time, and read again as it is drawn from:
     memory does not grow with logs. Without one, everything is kept.
@@ -185,6 +185,7 @@ def _asset_table(log: Log, learnable: np.ndarray, seen: np.ndarray) -> pd.DataFr
     return pd.DataFrame(
         {
             "log": pd.Series([log.name] * len(tracks), dtype=object),
+            "time_of_day": pd.Series([log.time_of_day] * len(tracks), dtype=object),
             "actor_id": pd.Series([track.actor_id for track in tracks], dtype=object),
             "actor_class": pd.Series([track.actor_class for track in tracks], dtype=object),
             "size_l": sizes[:, 0],

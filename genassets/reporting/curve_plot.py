@@ -4,17 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from genassets.parquet_reading import reading_parquet
+from genassets.reporting.plot_grid import LOG_RANGE, plot_grid
+
 Curve = tuple[str, NDArray[np.int64], NDArray[np.float64]]
 """Name, steps and values."""
 
-COLUMNS = 3
-LOG_RANGE = 50.0
-"""A curve of positive values that spans more than this factor is drawn on a logarithmic axis."""
+
+def read_curves(path: Path) -> list[Curve]:
+    """The curves of a curves.parquet by name, each in the order of its steps."""
+    import pyarrow.parquet as pq
+
+    points: dict[str, list[tuple[int, float]]] = {}
+    with reading_parquet(path):
+        rows = pq.read_table(path).to_pylist()
+    for row in rows:
+        points.setdefault(row["name"], []).append((row["step"], row["value"]))
+    curves = []
+    for name, pairs in sorted(points.items()):
+        steps, values = zip(*sorted(pairs), strict=True)
+        curves.append((name, np.array(steps, dtype=np.int64), np.array(values, dtype=np.float64)))
+    return curves
 
 
 def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
@@ -23,33 +37,8 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
     """
     if not curves:
         raise ValueError(f"{path}: no curve to draw")
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-    from matplotlib.figure import Figure
-
-    columns = min(COLUMNS, len(curves))
-    lines = -(-len(curves) // columns)
-    style: dict[Any, Any] = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": path.stem,
-        "font.size": 9,
-        "font.family": "sans-serif",
-    }
-    with rc_context(style):
-        width, height = 3.6 * columns, 2.3 * lines
-        figure = Figure(figsize=(width, height))
-        FigureCanvasSVG(figure)
-        # Fixed margins in inches: the automatic layouts take longer than all drawing.
-        figure.subplots_adjust(
-            left=0.55 / width,
-            right=1 - 0.12 / width,
-            bottom=0.45 / height,
-            top=1 - 0.3 / height,
-            wspace=0.62 / 2.9,
-            hspace=0.75 / 1.6,
-        )
-        axes = figure.subplots(lines, columns, squeeze=False).ravel()
-        for axis, (name, steps, values) in zip(axes, curves, strict=False):
+    with plot_grid(len(curves), path) as axes:
+        for axis, (name, steps, values) in zip(axes, curves, strict=True):
             alone = "o" if len(values) == 1 else None  # a line through one point shows nothing
             axis.plot(steps, values, color="#9db7d5", linewidth=0.8, marker=alone)
             if len(values) >= 20:
@@ -58,13 +47,6 @@ def write_curve_plot(curves: Sequence[Curve], path: Path) -> None:
                 axis.set_yscale("log")
             axis.set_title(name, fontsize=9, loc="left")
             axis.set_xlabel("step", fontsize=8)
-            axis.grid(color="#e3e6ea", linewidth=0.6)
-            axis.spines[["top", "right"]].set_visible(False)
-        for axis in axes[len(curves) :]:
-            axis.set_visible(False)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Without metadata the same curves give the same bytes.
-        figure.savefig(path, format="svg", metadata={"Date": None, "Creator": None})
 
 
 def running_mean(values: NDArray[np.float64], reach: int) -> NDArray[np.float64]:

@@ -108,7 +108,7 @@ def write_report(run_dir: Path) -> Path:
     page = environment.get_template(TEMPLATE).render(
         run=record,
         started=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(record.started)),
-        duration=_duration((record.finished or time.time()) - record.started),
+        duration=duration_text((record.finished or time.time()) - record.started),
         headlines=_headlines(metrics),
         lines=_stage_lines(record),
         sections=_sections(record, metrics, partial),
@@ -125,7 +125,7 @@ def write_report(run_dir: Path) -> Path:
 
 
 def _stage_lines(record: RunRecord) -> list[StageLine]:
-    seconds = [_making_seconds(step) for step in record.stages]
+    seconds = [making_seconds(step) for step in record.stages]
     longest = max([value for value in seconds if value is not None], default=0.0) or 1.0
     return [
         StageLine(
@@ -142,7 +142,7 @@ def _stage_lines(record: RunRecord) -> list[StageLine]:
     ]
 
 
-def _making_seconds(step: StepRecord) -> float | None:
+def making_seconds(step: StepRecord) -> float | None:
     """Seconds that the output took to make, from its manifest; of a step without output, what it ran."""
     if step.path is None:
         return step.seconds or None
@@ -175,20 +175,10 @@ def _plots(step: StepRecord, folder: Path) -> list[Picture]:
     path = Path(step.path or "") / CURVES
     if not path.is_file():
         return []
-    import numpy as np
-    import pyarrow.parquet as pq
+    from genassets.reporting.curve_plot import read_curves, write_curve_plot
 
-    from genassets.reporting.curve_plot import write_curve_plot
-
-    points: dict[str, list[tuple[int, float]]] = {}
-    for row in pq.read_table(path).to_pylist():
-        points.setdefault(row["name"], []).append((row["step"], row["value"]))
-    curves = []
-    for name, pairs in sorted(points.items()):
-        steps, values = zip(*sorted(pairs), strict=True)
-        curves.append((name, np.array(steps, dtype=np.int64), np.array(values, dtype=np.float64)))
     file = f"curves/{_file_name(step)}.svg"
-    write_curve_plot(curves, folder / file)
+    write_curve_plot(read_curves(path), folder / file)
     return [Picture(file, f"Curves of {step.key}", "Each value pale, its running mean dark.")]
 
 
@@ -268,6 +258,6 @@ def _machine() -> list[tuple[str, str]]:
     return values
 
 
-def _duration(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     minutes, rest = divmod(max(seconds, 0.0), 60.0)
     return f"{int(minutes)} min {rest:.0f} s" if minutes else f"{rest:.1f} s"

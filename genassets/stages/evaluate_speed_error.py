@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.parquet_reading import read_frame
 from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
@@ -96,7 +97,6 @@ def sweep(inputs: Inputs, config: SpeedErrorConfig, say: Callable[[str], None]) 
 def held_out_shots(inputs: Inputs, renderer: SceneRenderer, count: int) -> list[Shot]:
     """Scored held-out observations, spread over their order by size; so is every beginning of the list."""
     import numpy as np
-    import pandas as pd
 
     from genassets.curation.object_table import bounds_of, mask_of, read_object_table
     from genassets.errors import StageError
@@ -106,7 +106,7 @@ def held_out_shots(inputs: Inputs, renderer: SceneRenderer, count: int) -> list[
     from genassets.stages.ingested import open_ingested
 
     table = inputs.one("evaluate_reconstruction") / "observations.parquet"
-    scored = pd.read_parquet(table)
+    scored = read_frame(table)
     scored = scored[scored["predictor"] == "model"].sort_values("mask_px", kind="stable")
     if scored.empty:
         raise StageError(f"{table}: no held-out observation was scored; expected at least one to render")

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from genassets.evaluation.source_settings import SourceSettings
+from genassets.parquet_reading import read_frame
 from genassets.specs.split import Split
 from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
@@ -78,7 +79,7 @@ def run(inputs: Inputs, config: EvaluateTurnsConfig, out: Path, context: StageCo
 
     renderer = SceneRenderer.load(inputs.one("reconstruct"))
     lpips = Lpips(load_lpips_arrays("lpips-alexnet")) if config.lpips else None
-    views = pd.read_parquet(inputs.one("evaluate_reconstruction") / "views.parquet")
+    views = read_frame(inputs.one("evaluate_reconstruction") / "views.parquet")
     tables = inputs.shards("filter_occlusion")
     shards = {shard: open_ingested(path) for shard, path in inputs.shards("ingest").items()}
     logs = {log.name: log for log in shards.values()}

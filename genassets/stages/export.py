@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from genassets.parquet_reading import read_frame
 from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
@@ -204,7 +205,7 @@ def _measured(path: Path) -> dict[tuple[str, str], dict[str, float]]:
     """Means of the model's held-out measures by log and actor id."""
     import pandas as pd
 
-    table = pd.read_parquet(path)
+    table = read_frame(path)
     table = table[table["predictor"] == "model"]
     return {
         (row["log"], row["actor_id"]): {

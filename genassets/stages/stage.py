@@ -150,12 +150,14 @@ class Stage:
 
     Attributes:
         version: raised when the meaning or format of the output changes without a change of code.
-        needs: stages whose outputs are read. A sharded stage that needs a sharded stage reads its own shard.
+        needs: stages whose outputs are read. A sharded stage that needs a sharded stage reads its own shard,
+            save of `whole_inputs`.
         uses: stages whose outputs are read as well where the run makes them, and done without where it does not.
         modules: packages and modules of genassets whose code decides the result, by dotted name
             ("genassets.masks"); the stage's own module is always included.
         code_when: modules that decide the result with some configs alone, each with the test of a config. With the
             others neither they nor what only they import count as the stage's code.
+        whole_inputs: sharded stages of which a shard reads all shards, not its own alone.
         runtime_only: config fields that change how fast the result comes, never the result.
         location_files: outputs that say where data lie, not what they are; when only these change, the
             stages that read this one don't run again.
@@ -178,6 +180,7 @@ class Stage:
     sharded: bool
     summary: str
     uses: tuple[str, ...] = ()
+    whole_inputs: frozenset[str] = frozenset()
     code_when: Mapping[str, Callable[[Any], bool]] = field(default_factory=dict)
     runtime_only: frozenset[str] = frozenset()
     location_files: frozenset[str] = frozenset()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.parquet_reading import read_frame
 from genassets.stages.stage import MODEL_CODE, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
@@ -34,7 +35,6 @@ class TurntablesConfig(BaseModel):
 
 def run(inputs: Inputs, config: TurntablesConfig, out: Path, context: StageContext) -> list[Metric]:
     """Render the turns beside the truth of synthetic logs. There is nothing to measure: no metrics."""
-    import pandas as pd
 
     from genassets.driving.synthetic.truth import open_truth
     from genassets.evaluation.true_turns import true_turns
@@ -49,8 +49,8 @@ def run(inputs: Inputs, config: TurntablesConfig, out: Path, context: StageConte
     evaluated = inputs.one("evaluate_reconstruction")
     turned = select_actors(
         renderer.assets,
-        pd.read_parquet(evaluated / "actors.parquet"),
-        pd.read_parquet(evaluated / "views.parquet"),
+        read_frame(evaluated / "actors.parquet"),
+        read_frame(evaluated / "views.parquet"),
         config.actors,
     )
     roots = (ingested_root(path) for path in inputs.shards("ingest").values())

@@ -1,4 +1,4 @@
-"""Write the dataset's logs as a detector set: info files for BEVFormer and mmdetection3d, provenance, data card.
+"""Write the dataset's logs, with what was augmented, as a detector set: info files, provenance, data card.
 
 Writes set/ (docs/detection.md), which can be taken away as it is.
 """
@@ -34,6 +34,7 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
     from genassets.driving.image import read_image
     from genassets.errors import StageError
     from genassets.export.picture_list import PictureList
+    from genassets.stages.augment import LOGS
     from genassets.stages.ingested import ingested_root
 
     roots = {name: ingested_root(path) for name, path in inputs.shards("ingest").items()}
@@ -42,6 +43,14 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
             f"write_dataset.val: the dataset has no log {unknown[0]}; there are {', '.join(roots)}. Name one of them."
         )
     train = [root for name, root in roots.items() if name not in config.val]
+    if "augment" in inputs.objects:
+        changed = inputs.shards("augment")
+        train += [
+            log
+            for name in roots
+            if name not in config.val
+            for log in sorted((changed[name] / LOGS).iterdir())
+        ]
     settings = LabelSettings(camera=config.camera, empty_frames=config.empty_frames)
     card = write_detection_set(
         out / SET_FOLDER, train, [roots[name] for name in config.val], settings, context.progress
@@ -62,6 +71,7 @@ STAGE = Stage(
     version=1,
     config=WriteDatasetConfig,
     needs=("ingest",),
+    uses=("augment",),
     modules=(
         "genassets.detection",
         "genassets.driving",

@@ -7,4 +7,4 @@ import re
 
 def shown_address(address: str) -> str:
     """The address without the user and password that it may carry (http://user:password@host, postgresql://...)."""
-    return re.sub(r"(://)[^/@\s]*@", r"\1", address)
+    return re.sub(r"(://)[^/\s]*@", r"\1", address)

@@ -15,6 +15,7 @@ from genassets.pipeline.home import Home
 from genassets.pipeline.plan import Workflow
 from genassets.pipeline.run_record import RunRecord, StepRecord, list_runs
 from genassets.pipeline.store import StoredObject
+from genassets.tracking.address import shown_address
 from genassets.tracking.metric_names import flat_params, named_metrics
 from genassets.tracking.mlflow_sender import MlflowSender
 from genassets.tracking.spool import Spool
@@ -83,6 +84,7 @@ class MlflowListener:
             cached=step.cached,
             seconds=step.seconds,
             path=step.path,
+            content=stored.content if stored is not None else None,
             tags={name: value for name, value in tags.items() if value},
             params=dict(flat_params(self._resolved.get(step.name, {}))),
             metrics=named_metrics(rows),
@@ -97,7 +99,7 @@ class MlflowListener:
             self._thread.join(self._patience)
         if self._failure is not None or self._spool.is_pending():
             print(
-                f"genassets: MLflow at {self._sender.uri} did not take everything "
+                f"genassets: MLflow at {shown_address(self._sender.uri)} did not take everything "
                 f"({self._failure or 'it is slow'}); the rest is kept in {self._spool.folder} and the next run "
                 "sends it",
                 file=sys.stderr,
@@ -119,7 +121,7 @@ class MlflowListener:
                 more = self._wake.get()
                 self._sender.send(self._spool)
         except Exception as error:
-            self._failure = f"{type(error).__name__}: {error}".splitlines()[0][:300]
+            self._failure = shown_address(f"{type(error).__name__}: {error}".splitlines()[0][:300])
             log.warning("MLflow failed", exc_info=error)
 
 

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import logging
 import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
+from genassets.errors import DamagedFile
+from genassets.parquet_reading import reading_parquet
 from genassets.pipeline.home import Home
+from genassets.tracking.registered_models import REGISTERED
 from genassets.tracking.spool import Spool, SpoolState
 
 if TYPE_CHECKING:
     from mlflow.entities import Metric
     from mlflow.tracking import MlflowClient
 
+log = logging.getLogger("genassets.tracking")
+
 BATCH = 1000  # most metrics that log_batch takes at once
 PARAM_BATCH = 100
+DATASET_STAGE = "ingest"
+DIGEST_LETTERS = 36  # most that MLflow takes of a dataset's digest
 _STATUS = {"completed": "FINISHED", "partly_failed": "FINISHED", "interrupted": "KILLED", "crashed": "KILLED"}
 
 
@@ -40,6 +48,8 @@ class MlflowSender:
             for name, value in {
                 "MLFLOW_DISABLE_TELEMETRY": "true",
                 "DO_NOT_TRACK": "1",
+                # It prints the whole address, with a password that is in it, between the lines of the progress.
+                "MLFLOW_SUPPRESS_PRINTING_URL_TO_STDOUT": "true",
                 # A server that is away is found out in seconds: the spool keeps the events meanwhile.
                 "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
                 "MLFLOW_HTTP_REQUEST_TIMEOUT": "20",
@@ -75,12 +85,15 @@ class MlflowSender:
         if event["event"] == "run_started":
             if state.parent is None:
                 experiment = self._experiment(event["experiment"])
-                run = client.create_run(experiment, milliseconds, event["tags"], event["run_id"])
-                state.parent = run.info.run_id
+                state.parent = self._made_before(
+                    experiment, f"tags.`genassets.run_id` = '{event['run_id']}'"
+                ) or self._create(experiment, milliseconds, event["tags"], event["run_id"])
             self._params(state.parent, event["params"])
         elif event["event"] == "stage_finished":
             assert state.parent is not None
             self._metrics(state.parent, event["metrics"], milliseconds)
+            if event["tags"].get("genassets.stage") == DATASET_STAGE and event.get("content"):
+                self._dataset(state.parent, event)
             if not event["cached"]:
                 self._child(event, state, milliseconds)
         elif event["event"] == "run_finished":
@@ -97,8 +110,10 @@ class MlflowSender:
             experiment = client.get_run(state.parent).info.experiment_id
             started = milliseconds - int(event["seconds"] * 1000)
             tags = {"mlflow.parentRunId": state.parent, **event["tags"]}
-            child = client.create_run(experiment, started, tags, event["key"])
-            state.children[event["key"]] = child.info.run_id
+            mine = f"tags.`mlflow.parentRunId` = '{state.parent}' and attributes.run_name = '{event['key']}'"
+            state.children[event["key"]] = self._made_before(experiment, mine) or self._create(
+                experiment, started, tags, event["key"]
+            )
         run_id = state.children[event["key"]]
         self._params(run_id, event["params"])
         self._metrics(run_id, {**event["metrics"], "seconds": event["seconds"]}, milliseconds)
@@ -107,7 +122,46 @@ class MlflowSender:
             pictures = Path(event["path"]) / "pictures"
             if pictures.is_dir():
                 client.log_artifacts(run_id, str(pictures), "pictures")
+            self._register(event, client.get_run(state.parent).info.experiment_id, run_id)
         client.set_terminated(run_id, _STATUS.get(event["status"], "FAILED"), milliseconds)
+
+    def _dataset(self, run_id: str, event: dict[str, Any]) -> None:
+        """Say which log the run read: by name and the digest of its content."""
+        from mlflow.entities import Dataset, DatasetInput
+
+        log_name = event["tags"].get("genassets.shard", event["key"])
+        dataset = Dataset(log_name, event["content"][:DIGEST_LETTERS], "genassets log", event["path"])
+        self.connect().log_inputs(run_id, [DatasetInput(dataset)])
+
+    def _register(self, event: dict[str, Any], experiment: str, run_id: str) -> None:
+        """Make what the stage trained the newest version of the experiment's model, once."""
+        client = self.connect()
+        model = REGISTERED.get(event["tags"].get("genassets.stage", ""))
+        if model is None or event["status"] != "completed":
+            return
+        name = f"{client.get_experiment(experiment).name}-{model.name}"
+        if client.search_model_versions(f"run_id = '{run_id}'"):
+            return
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                model.write(Path(event["path"]), Path(folder))
+            except FileNotFoundError as error:  # collected since; later events are not to wait for ever
+                log.warning("no version of %s: %s", name, error)
+                return
+            client.log_artifacts(run_id, folder, "model")
+        if not client.search_registered_models(f"name = '{name}'"):
+            client.create_registered_model(name)
+        source = f"{client.get_run(run_id).info.artifact_uri}/model"
+        tags = {tag: event["tags"][tag] for tag in ("genassets.fingerprint",) if tag in event["tags"]}
+        client.create_model_version(name, source, run_id, tags)
+
+    def _made_before(self, experiment: str, mine: str) -> str | None:
+        """The run that an earlier try made whose answer was lost."""
+        found = self.connect().search_runs([experiment], mine, max_results=1)
+        return str(found[0].info.run_id) if found else None
+
+    def _create(self, experiment: str, milliseconds: int, tags: dict[str, str], name: str) -> str:
+        return str(self.connect().create_run(experiment, milliseconds, tags, name).info.run_id)
 
     def _experiment(self, name: str) -> str:
         client = self.connect()
@@ -141,7 +195,12 @@ class MlflowSender:
             return
         import pyarrow.parquet as pq
 
-        points = pq.read_table(path / CURVES).to_pylist()
+        try:
+            with reading_parquet(path / CURVES):
+                points = pq.read_table(path / CURVES).to_pylist()
+        except DamagedFile as error:  # what comes after it is not to wait for it for ever
+            log.warning("curves are left out: %s", error)
+            return
         named = ((clean_name(f"curves/{point['name']}"), point) for point in points)
         self._batches(
             run_id, [Metric(name, point["value"], milliseconds, point["step"]) for name, point in named]

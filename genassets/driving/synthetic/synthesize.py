@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -111,14 +111,18 @@ class Scene:
         return np.asarray(np.arctan2(away[1], away[0]) - heading)
 
 
-def make_scene(spec: CitySpec, seed: int) -> Scene:
-    """The scene of a spec and a seed."""
+def make_scene(
+    spec: CitySpec,
+    seed: int,
+    recast: Callable[[tuple[Actor, ...]], Sequence[Actor]] = lambda actors: actors,
+) -> Scene:
+    """The scene of a spec and a seed. recast: who is there instead of those that were drawn."""
     streams = np.random.SeedSequence(seed).spawn(4)
     city_rng, crowd_rng, light_rng, rng = (np.random.default_rng(stream) for stream in streams)
     ego, layout = ego_drive(spec)
     ego_car = ego_model()
     city = build_city(layout, city_rng)
-    actors = populate(spec, layout, ego, ego_car.size, crowd_rng)
+    actors = tuple(recast(populate(spec, layout, ego, ego_car.size, crowd_rng)))
     light = draw_light(spec.time_of_day == "night", city.lamps, light_rng)
     dark = glow_table(light.night, moving=False)
     placed = [Placed(city.mesh, 0, dark)]

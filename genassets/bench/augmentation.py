@@ -1,0 +1,332 @@
+"""Composing swapped actors into images, beside rendering whole frames: seconds, error to the true picture, labels."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from genassets.bench.benchmark import Benchmark, Row
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from genassets.augmentation.compose import ComposedImage
+    from genassets.augmentation.edits import Edit
+    from genassets.city_spec import CitySpec
+    from genassets.driving.log import Log, Track
+    from genassets.driving.synthetic.actors import Actor
+    from genassets.reconstruction.library import AssetLibrary
+    from genassets.reconstruction.settings import ReconstructionSettings
+
+View = tuple[str, int]
+"""Camera and frame."""
+
+VIEWS: tuple[View, ...] = tuple(
+    (camera, frame) for camera in ("front_camera", "left_camera", "back_camera") for frame in (1, 5, 9)
+)
+LARGE_VIEWS: tuple[View, ...] = (
+    ("front_camera", 1),
+    ("front_camera", 5),
+    ("left_camera", 5),
+    ("back_camera", 5),
+)
+LARGER = 4
+"""480 x 270 times this is the size of PandaSet's images."""
+STEPS = 350
+CLASSES = ("Car",)
+"""Whose actors change places: as many of a kind as there are, so that every asset has a true mesh."""
+
+SEED = 1
+LEAST_SIDE = 12
+"""Pixels of an asset's box, along its shorter side, from which its label is judged."""
+
+GOOD_IOU = 0.8
+
+
+@dataclass(frozen=True)
+class Swap:
+    """Actors of a log that change places: edits of the log, and of each actor whose model stands in its place."""
+
+    edits: tuple[Edit, ...]
+    model_of: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Made:
+    """Images of views in which something changes, and the processor seconds that each took, by way."""
+
+    views: list[View]
+    composed: list[ComposedImage]
+    rendered: list[NDArray[np.uint8]]
+    seconds: dict[str, list[float]]
+
+    def mean(self, way: str) -> float:
+        """Mean seconds without the first image, for which much is read that later ones keep."""
+        rest = self.seconds[way][1:]
+        return sum(rest) / max(len(rest), 1)
+
+
+@dataclass(frozen=True)
+class Labels:
+    """How well boxes fit what is seen: intersection over union of their bounds, one an unoccluded asset and image."""
+
+    ious: list[float]
+
+    @property
+    def text(self) -> str:
+        good = sum(iou >= GOOD_IOU for iou in self.ious)
+        return f"{good / len(self.ious):.3f} ({len(self.ious)})" if self.ious else "none"
+
+
+def run(say: Callable[[str], None]) -> Sequence[Row]:
+    """Synthesize a log of the demo's kind, learn its actors with a laptop profile's model, and let its cars change
+    places.
+    """
+    from genassets.bench.visible_cost import laptop_settings
+    from genassets.city_spec import CitySpec
+    from genassets.driving.synthetic.synthesize import synthesize_log
+
+    spec = CitySpec(vehicles=16, pedestrians=3)
+    with tempfile.TemporaryDirectory(prefix="genassets-bench-") as root:
+        say("synthesizing the log")
+        log_root = synthesize_log(spec, SEED, "swapped", Path(root))
+        settings = laptop_settings().model_copy(update={"steps": STEPS})
+        library = learn(log_root, settings, Path(root) / "work", say)
+        return measure(log_root, spec, SEED, library, VIEWS, LARGE_VIEWS, say)
+
+
+def learn(
+    log_root: Path, settings: ReconstructionSettings, work: Path, say: Callable[[str], None]
+) -> AssetLibrary:
+    """The library of a log, learned from all its images."""
+    from genassets.driving import open_log, steady_heights
+    from genassets.reconstruction.library import make_library
+    from genassets.reconstruction.training import build_model, train
+    from genassets.reconstruction.training_data import prepare_training
+
+    log = steady_heights(open_log(log_root))
+    stride = 2**settings.model.rgb_upsamplings
+    assets, data = prepare_training([log], tuple(log.cameras), lambda frame: True, settings, stride)
+    model = build_model(assets, [log.name], settings, SEED)
+    work.mkdir(parents=True)
+
+    def progress(done: float, total: float, message: str) -> None:
+        if done % 100 == 0:
+            say(message)
+
+    train(model, data, settings, SEED, work, progress, lambda *_: None)
+    model.eval()
+    return make_library(
+        assets, model, settings, [part.scene for part in data], [part.occupancy for part in data]
+    )
+
+
+def measure(
+    log_root: Path,
+    spec: CitySpec,
+    seed: int,
+    library: AssetLibrary,
+    views: Sequence[View],
+    large_views: Sequence[View],
+    say: Callable[[str], None],
+) -> Sequence[Row]:
+    """One row for each way to change an image: over some views, and its seconds once more at LARGER times the size.
+
+    Seconds are of this process's processors, all threads together, so that a busy machine does not count. They leave
+    out each way's first image, for which much is read that later ones keep. PSNR is to the true picture of the city
+    with the same meshes in the same places, over the pixels that composing reports as changed and over all others,
+    pooled over all images.
+    """
+    from genassets.bench.enlarged import enlarged
+    from genassets.driving import open_log, steady_heights
+    from genassets.driving.synthetic.synthesize import camera_view, make_scene
+
+    log = steady_heights(open_log(log_root))
+    swap = change_places(log, library, CLASSES)
+    small = make_images(log, library, swap, views, say)
+    large = make_images(enlarged(log, LARGER), library, swap, large_views, say)
+    scene = make_scene(spec, seed, lambda actors: recast(actors, swap.model_of))
+    labels, true_labels, truths = Labels([]), Labels([]), []
+    swapped = with_tracks(log, swap)
+    for (camera, frame), composed in zip(small.views, small.composed, strict=True):
+        picture, truth = camera_view(scene, camera, frame)
+        truths.append(truth)
+        labels.ious.extend(label_ious(swapped, camera, frame, composed.visible))
+        seen = {
+            edit.placed.track.actor_id: picture.instances == _instance(scene.actors, edit.removed)
+            for edit in swap.edits
+            if edit.placed is not None and edit.removed is not None
+        }
+        true_labels.ious.extend(label_ious(swapped, camera, frame, seen))
+    masks = [composed.changed for composed in small.composed]
+    ways = {
+        "composed": [composed.image for composed in small.composed],
+        "whole frame": small.rendered,
+        "the log's own": [log.cameras[camera].image(frame) for camera, frame in small.views],
+    }
+    rows: list[Row] = []
+    for name, images in ways.items():
+        row: dict[str, str | int | float] = {"image": name, "images": len(images)}
+        for made, size in ((small, _size(log, 1)), (large, _size(log, LARGER))):
+            row[f"s at {size}"] = round(made.mean(name), 3) if name in made.seconds else ""
+            times = made.mean("whole frame") / max(made.mean("composed"), 1e-9)
+            row[f"times faster at {size}"] = round(times, 1) if name == "composed" else ""
+        row["PSNR where changed"] = _psnr(images, truths, masks)
+        row["PSNR elsewhere"] = _psnr(images, truths, [~mask for mask in masks])
+        row["share changed"] = round(float(sum(mask.mean() for mask in masks)) / len(masks), 3)
+        row["boxes of IoU >= 0.8 (n)"] = labels.text if name == "composed" else ""
+        row["with true masks"] = true_labels.text if name == "composed" else ""
+        rows.append(row)
+    return rows
+
+
+def make_images(
+    log: Log, library: AssetLibrary, swap: Swap, views: Sequence[View], say: Callable[[str], None]
+) -> Made:
+    """The views in which something changes, composed and rendered."""
+    from genassets.augmentation.compose import Composer
+    from genassets.augmentation.compose_settings import ComposeSettings
+    from genassets.reconstruction.scene_renderer import SceneRenderer
+
+    composer = Composer(log, SceneRenderer(library), swap.edits, ComposeSettings())
+    whole = SceneRenderer(with_swapped(library, log.name, swap))
+    swapped = with_tracks(log, swap)
+    made = Made([], [], [], {"composed": [], "whole frame": []})
+    for camera, frame in views:
+        say(f"{camera}, frame {frame}, {_size(log, 1)}")
+        start = time.process_time()
+        composed = composer.compose(camera, frame)
+        if composed is None:
+            continue
+        made.seconds["composed"].append(time.process_time() - start)
+        start = time.process_time()
+        rendered = whole.render_image(swapped, camera, frame)
+        made.seconds["whole frame"].append(time.process_time() - start)
+        made.views.append((camera, frame))
+        made.composed.append(composed)
+        made.rendered.append(_bytes(rendered, composed.image.shape))
+    return made
+
+
+def change_places(log: Log, library: AssetLibrary, classes: Sequence[str]) -> Swap:
+    """Each actor of some classes that the library has learned is replaced by the next longer one, the longest by the
+    shortest.
+    """
+    from genassets.augmentation.edits import Edit, PlacedAsset
+
+    index = library.indices_of_log(log.name)
+    chosen = [track for track in log.tracks if track.actor_class in classes and track.actor_id in index]
+    chosen.sort(key=lambda track: (float(track.size[0]), track.actor_id))
+    edits, model_of = [], {}
+    for number, track in enumerate(chosen):
+        other = chosen[(number + 1) % len(chosen)]
+        poses = track.world_from_box.copy()
+        poses[:, 2, 3] += (other.size[2] - track.size[2]) / 2
+        identity = f"{other.actor_id}-in-place-of-{track.actor_id}"
+        placed = replace(track, actor_id=identity, uuids=(identity,), size=other.size, world_from_box=poses)
+        edits.append(Edit(track, PlacedAsset(index[other.actor_id], placed)))
+        model_of[track.actor_id] = other.actor_id
+    return Swap(tuple(edits), model_of)
+
+
+def recast(actors: Sequence[Actor], model_of: Mapping[str, str]) -> tuple[Actor, ...]:
+    """The city's actors with the meshes of those that stand in their places now; paths and instances stay."""
+    models = {actor.actor_id: actor.model for actor in actors}
+    return tuple(
+        replace(actor, model=models[model_of.get(actor.actor_id, actor.actor_id)]) for actor in actors
+    )
+
+
+def with_tracks(log: Log, swap: Swap) -> Log:
+    """The log with the placed assets' tracks instead of the removed actors'."""
+    tracks = [track for track in log.tracks if track.actor_id not in swap.model_of]
+    tracks += [edit.placed.track for edit in swap.edits if edit.placed is not None]
+    return replace(log, tracks=tuple(tracks))
+
+
+def with_swapped(library: AssetLibrary, log_name: str, swap: Swap) -> AssetLibrary:
+    """The library with the placed assets under their new ids, so that the scene renderer finds them in the log."""
+    assets = library.assets.copy()
+    for edit in swap.edits:
+        assert edit.placed is not None
+        row = assets.index[edit.placed.row]
+        assets.loc[row, ["log", "actor_id"]] = [log_name, edit.placed.track.actor_id]
+    return replace(library, assets=assets)
+
+
+def label_ious(log: Log, camera: str, frame: int, visible: Mapping[str, NDArray[np.bool_]]) -> list[float]:
+    """IoU of the bounds of each visible mask with those of its box; of boxes whole in the image, large enough, and
+    not touched by a nearer one.
+    """
+    import numpy as np
+
+    from genassets.augmentation.shot import Shot
+    from genassets.curation.occlusion import occluded_fractions
+
+    shot = Shot(log, camera, frame)
+    boxes = [(track, shot.box(track)) for track in log.tracks]
+    seen = [(track, box) for track, box in boxes if box is not None]
+    hidden = occluded_fractions([box.hull for _, box in seen], [box.depth for _, box in seen])
+    found = []
+    for (track, box), share in zip(seen, hidden, strict=True):
+        x0, y0, x1, y1 = box.bounds
+        if track.actor_id not in visible or share or box.truncation or min(x1 - x0, y1 - y0) < LEAST_SIDE:
+            continue
+        rows, columns = np.nonzero(visible[track.actor_id])
+        if not len(rows):
+            found.append(0.0)
+            continue
+        own = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
+        width = max(0.0, min(x1, own[2]) - max(x0, own[0]))
+        height = max(0.0, min(y1, own[3]) - max(y0, own[1]))
+        union = (x1 - x0) * (y1 - y0) + (own[2] - own[0]) * (own[3] - own[1]) - width * height
+        found.append(float(width * height / union))
+    return found
+
+
+def _instance(actors: Sequence[Actor], track: Track) -> int:
+    return next(actor.instance for actor in actors if actor.actor_id in track.uuids)
+
+
+def _size(log: Log, factor: int) -> str:
+    camera = next(iter(log.cameras.values())).intrinsics
+    return f"{factor * camera.width} x {factor * camera.height}"
+
+
+def _bytes(image: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A render as bytes, at the size of the log's images."""
+    import cv2
+    import numpy as np
+
+    full = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.rint(255 * np.clip(full, 0, 1)).astype(np.uint8)
+
+
+def _psnr(
+    images: Sequence[NDArray[np.uint8]],
+    truths: Sequence[NDArray[np.uint8]],
+    masks: Sequence[NDArray[np.bool_]],
+) -> float:
+    """PSNR in dB over the masked pixels of all images together."""
+    import numpy as np
+
+    from genassets.evaluation.image import capped, masked_psnr
+
+    made = np.concatenate([image[mask] for image, mask in zip(images, masks, strict=True)])
+    true = np.concatenate([truth[mask] for truth, mask in zip(truths, masks, strict=True)])
+    everywhere = np.ones((1, len(made)), dtype=bool)
+    return round(capped(masked_psnr(made[None] / 255, true[None] / 255, everywhere)), 2)
+
+
+BENCHMARK = Benchmark(
+    name="augmentation",
+    summary="Cars of a synthetic log in each other's places: images composed into the log's own, and whole frames "
+    "rendered, beside the true picture. Processor seconds; PSNR in dB; share of the boxes of unoccluded assets whose "
+    "bounds have IoU of at least 0.8 with those of what is seen of them",
+    run=run,
+)
