@@ -14,6 +14,7 @@ import signal
 from collections.abc import Mapping
 from typing import Any
 
+import dask
 from distributed import Client, Nanny, Scheduler, Security, SpecCluster
 from distributed.diagnostics.plugin import WorkerPlugin
 
@@ -50,29 +51,31 @@ class LocalWorkers:
             "silence_logs": logging.CRITICAL,
         }
         kinds = {f"{SHARD}-{number}": (SHARD, _shard_threads(count)) for number in range(count)}
-        kinds[WHOLE] = (WHOLE, _whole_threads())
-        self._cluster = SpecCluster(
-            scheduler={
-                "cls": Scheduler,
-                "options": {
-                    "host": LOOPBACK,
-                    "protocol": "tls://",
-                    "security": self.security,
-                    "dashboard": False,
-                    "dashboard_address": PAGES,
-                    "allowed_failures": MORE_TRIES,
+        kinds[WHOLE] = (WHOLE, {})
+        # Dask would give each process one thread; the one for all logs has what this one has.
+        with dask.config.set({"distributed.nanny.pre-spawn-environ": {}}):
+            self._cluster = SpecCluster(
+                scheduler={
+                    "cls": Scheduler,
+                    "options": {
+                        "host": LOOPBACK,
+                        "protocol": "tls://",
+                        "security": self.security,
+                        "dashboard": False,
+                        "dashboard_address": PAGES,
+                        "allowed_failures": MORE_TRIES,
+                    },
                 },
-            },
-            workers={
-                name: {
-                    "cls": Nanny,
-                    "options": {**common, "resources": {kind: 1}, "env": {**threads, **environment}},
-                }
-                for name, (kind, threads) in kinds.items()
-            },
-            security=self.security,
-            silence_logs=logging.CRITICAL,
-        )
+                workers={
+                    name: {
+                        "cls": Nanny,
+                        "options": {**common, "resources": {kind: 1}, "env": {**threads, **environment}},
+                    }
+                    for name, (kind, threads) in kinds.items()
+                },
+                security=self.security,
+                silence_logs=logging.CRITICAL,
+            )
         self.address: str = self._cluster.scheduler_address
 
     def ready(self, client: Client) -> None:
@@ -106,9 +109,3 @@ def _shard_threads(count: int) -> dict[str, str]:
     """Threads of each of ``count`` processes, so that together they have a thread a core."""
     cores = int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
     return dict.fromkeys(THREAD_VARIABLES, str(max(cores // count, 1)))
-
-
-def _whole_threads() -> dict[str, str]:
-    """What the user has set, else every core; Dask would set one."""
-    cores = str(os.cpu_count() or 1)
-    return {name: os.environ.get(name, cores) for name in THREAD_VARIABLES}
