@@ -26,6 +26,7 @@ WITHOUT_EFFECT = frozenset(
         "genassets.errors",
         "genassets.model_file",
         "genassets.package_archive",
+        "genassets.parquet_reading",
         "genassets.stages",
         "genassets.stages.stage",
     }
