@@ -14,13 +14,13 @@ from pydantic import Field
 
 from genassets.augmentation.settings import AugmentSettings
 from genassets.errors import StageError
+from genassets.stages.augmented import LOGS
 from genassets.stages.stage import MODEL_CODE, Borrowed, Inputs, Metric, Stage, StageContext
 
 if TYPE_CHECKING:
     from genassets.driving import Log
     from genassets.export.picture_list import PictureList
 
-LOGS = "logs"
 MAKERS = {"reconstructed": "reconstruct", "generated": "generate"}
 """The stages that make the kinds of assets."""
 DONE = "done"

@@ -34,7 +34,7 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
     from genassets.driving.image import read_image
     from genassets.errors import StageError
     from genassets.export.picture_list import PictureList
-    from genassets.stages.augment import LOGS
+    from genassets.stages.augmented import augmented_roots
     from genassets.stages.ingested import ingested_root
 
     roots = {name: ingested_root(path) for name, path in inputs.shards("ingest").items()}
@@ -44,12 +44,9 @@ def run(inputs: Inputs, config: WriteDatasetConfig, out: Path, context: StageCon
         )
     train = [root for name, root in roots.items() if name not in config.val]
     if "augment" in inputs.objects:
-        changed = inputs.shards("augment")
+        changed = inputs.shards("augment").items()
         train += [
-            log
-            for name in roots
-            if name not in config.val
-            for log in sorted((changed[name] / LOGS).iterdir())
+            log for name, output in changed if name not in config.val for log in augmented_roots(output)
         ]
     settings = LabelSettings(camera=config.camera, empty_frames=config.empty_frames)
     card = write_detection_set(
