@@ -1,4 +1,4 @@
-"""The prior as one module: denoising network, statistics of the library's codes, noise schedule.
+"""The prior as one module: denoising network, normal distribution and statistics of the library's codes, noise schedule.
 
 What is diffused is an asset: its standardised latent code and, as three more channels, the standardised logarithms of
 its length, width and height. A code says how a body departs from the box that it was learned in, so it is
@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from genassets.prior.conditions import Conditions
+from genassets.prior.gaussian import GaussianDenoiser
 from genassets.prior.network import DenoisingNetwork
 from genassets.prior.schedule import make_schedule
 from genassets.prior.settings import PriorSettings
@@ -80,6 +81,7 @@ class AssetPrior(nn.Module):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             self.network = DenoisingNetwork(channels + SIZES, settings.network)
+        self.gaussian = GaussianDenoiser((channels + SIZES) * height * width, settings.gaussian_axes)
         self.register_buffer("code_mean", codes.mean.reshape(-1, 1, 1))
         self.register_buffer("code_deviation", codes.deviation.reshape(-1, 1, 1))
         self.register_buffer("size_mean", sizes.mean.clone())
@@ -123,16 +125,17 @@ class AssetPrior(nn.Module):
 
         Guidance 0 and 1 take one evaluation of the network, others two in one batch. Gradients flow.
         """
+        known = self.gaussian.velocity(noisy, t, self.schedule)
         if guidance == 1.0:
-            return self.network(noisy, t, conditions)
+            return known + self.network(noisy, t, conditions)
         if guidance == 0.0:
-            return self.network(noisy, t, conditions.opened())
+            return known + self.network(noisy, t, conditions.opened())
         opened = conditions.opened()
         both = Conditions(
             torch.cat((conditions.actor_class, opened.actor_class)), torch.cat((conditions.time, opened.time))
         )
         conditional, free = self.network(torch.cat((noisy, noisy)), torch.cat((t, t)), both).chunk(2)
-        return free + guidance * (conditional - free)
+        return known + free + guidance * (conditional - free)
 
     def denoise(
         self,

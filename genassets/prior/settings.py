@@ -54,6 +54,11 @@ class PriorSettings(_Settings):
     """One prior: network, noise schedule, and how long it learns."""
 
     network: NetworkSettings = NetworkSettings()
+    gaussian_axes: Annotated[int, Field(ge=0)] = Field(
+        default=256,
+        description="axes, at most, of the library's normal distribution, whose denoiser the network adds to; 0: the "
+        "network alone, as in the paper",
+    )
     schedule: Literal["cosine", "linear"] = Field(
         default="cosine", description="noise schedule, rescaled to end in pure noise"
     )
