@@ -152,10 +152,16 @@ def test_a_checkpoint_of_another_prior_is_refused(codes: LibraryCodes, tmp_path:
 
 
 def test_training_stops_at_a_loss_that_is_not_finite(codes: LibraryCodes) -> None:
-    trainer = PriorTrainer(replace(codes, mean=codes.mean * float("nan")), TINY, 0)
+    trainer = PriorTrainer(codes, TINY, 0)
+    trainer.codes = replace(codes, mean=codes.mean * float("nan"))
     with pytest.raises(StageError, match="the loss is nan.*at step 0"):
         trainer.advance()
     assert trainer.step == 0
+
+
+def test_codes_that_are_not_finite_are_refused(codes: LibraryCodes) -> None:
+    with pytest.raises(StageError, match="a code of the library is not finite"):
+        PriorTrainer(replace(codes, deviation=codes.deviation * float("inf")), TINY, 0)
 
 
 def test_the_loss_is_that_of_v(prior: AssetPrior, codes: LibraryCodes) -> None:

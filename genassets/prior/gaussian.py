@@ -1,7 +1,7 @@
 """The normal distribution of a library's assets as a denoiser: the part of the prior that has a closed form.
 
-A library of some hundred actors is too small for a network to find their covariance by gradient steps: samples then keep
-noise that no actor has. The best linear denoiser knows it at once, and the network learns what that leaves.
+From some hundred actors a network finds their covariance slowly by gradient steps, and until then samples keep noise
+that no actor has. The best linear denoiser knows it at once; the network learns what that leaves.
 """
 
 from __future__ import annotations

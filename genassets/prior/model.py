@@ -1,4 +1,4 @@
-"""The prior as one module: denoising network, normal distribution and statistics of the library's codes, noise schedule.
+"""The prior as one module: denoising network, the codes' normal distribution and moments, noise schedule.
 
 What is diffused is an asset: its standardised latent code and, as three more channels, the standardised logarithms of
 its length, width and height. A code says how a body departs from the box that it was learned in, so it is

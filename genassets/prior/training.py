@@ -67,6 +67,10 @@ class PriorTrainer:
     pages = None
 
     def __init__(self, codes: LibraryCodes, settings: PriorSettings, seed: int) -> None:
+        if not torch.isfinite(codes.mean).all() or not torch.isfinite(codes.deviation).all():
+            raise StageError(
+                "train_prior: a code of the library is not finite; run the reconstruct stage again, with other rates"
+            )
         self.settings, self.seed = settings, seed
         self.codes = codes
         self.validates = held_out(codes.conditions, settings.held_out, seed)
