@@ -125,17 +125,21 @@ class AssetPrior(nn.Module):
 
         Guidance 0 and 1 take one evaluation of the network, others two in one batch. Gradients flow.
         """
-        known = self.gaussian.velocity(noisy, t, self.schedule)
         if guidance == 1.0:
-            return known + self.network(noisy, t, conditions)
-        if guidance == 0.0:
-            return known + self.network(noisy, t, conditions.opened())
+            return self._predicted(noisy, t, conditions)
         opened = conditions.opened()
+        if guidance == 0.0:
+            return self._predicted(noisy, t, opened)
         both = Conditions(
             torch.cat((conditions.actor_class, opened.actor_class)), torch.cat((conditions.time, opened.time))
         )
-        conditional, free = self.network(torch.cat((noisy, noisy)), torch.cat((t, t)), both).chunk(2)
-        return known + free + guidance * (conditional - free)
+        conditional, free = self._predicted(torch.cat((noisy, noisy)), torch.cat((t, t)), both).chunk(2)
+        return free + guidance * (conditional - free)
+
+    def _predicted(self, noisy: Tensor, t: Tensor, conditions: Conditions) -> Tensor:
+        return self.gaussian.velocity(noisy, t, conditions, self.schedule) + self.network(
+            noisy, t, conditions
+        )
 
     def denoise(
         self,

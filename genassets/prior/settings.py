@@ -55,8 +55,8 @@ class PriorSettings(_Settings):
 
     network: NetworkSettings = NetworkSettings()
     gaussian_axes: Annotated[int, Field(ge=0)] = Field(
-        default=256,
-        description="axes, at most, of the library's normal distribution, whose denoiser the network adds to; 0: the "
+        default=64,
+        description="axes, at most, of each class's normal distribution, whose denoiser the network adds to; 0: the "
         "network alone, as in the paper",
     )
     schedule: Literal["cosine", "linear"] = Field(

@@ -88,7 +88,8 @@ class PriorTrainer:
         if settings.gaussian_axes:
             noise = codes.deviation[self.learned] / self.model.code_deviation
             assets = self.model.assets(mean, codes.sizes[self.learned])
-            self.model.gaussian.fit(assets, float((settings.posterior_noise * noise).square().mean()))
+            own = codes.conditions[self.learned]
+            self.model.gaussian.fit(assets, own, float((settings.posterior_noise * noise).square().mean()))
         self.averaged = copy.deepcopy(self.model).eval().requires_grad_(False)
         self.optimiser = torch.optim.Adam(self.model.parameters(), lr=settings.rate, fused=True)
         self.step = 0
