@@ -328,7 +328,7 @@ def test_the_evaluation_sets_the_prior_beside_floor_and_ceilings(
     said = next(
         metric.method for metric in found if metric.metric == "fid" and metric.method.startswith("model")
     )
-    assert "12 renders, 12 real crops, seed 0" in said and "guidance 1.5" in said
+    assert "12 renders, 12 real crops, seed 0" in said and "guidance 1" in said
     assert (tmp_path / "pictures" / "sets.png").is_file()
 
 

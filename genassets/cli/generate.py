@@ -36,7 +36,7 @@ def generate(
     steps: Annotated[int, typer.Option(min=1, help="Evaluations of the network for an actor.")] = 25,
     guidance: Annotated[
         float, typer.Option(min=0, help="0: class and time left out; 1: as learned; more exaggerates.")
-    ] = 1.5,
+    ] = 1.0,
     solver: Annotated[str, typer.Option(help="dpm, ddim or ddpm.")] = "dpm",
     pictured: Annotated[int, typer.Option(min=0, help="Actors in the picture sheet.")] = 8,
     out: Annotated[

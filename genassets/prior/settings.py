@@ -97,6 +97,6 @@ class SamplingSettings(_Settings):
         default="dpm", description="ddpm: noise at every step; ddim: none; dpm: DPM-Solver++ of second order"
     )
     guidance: Annotated[float, Field(ge=0)] = Field(
-        default=1.5,
+        default=1.0,
         description="classifier-free guidance: 0 leaves conditions out, 1 is the conditional model, more exaggerates",
     )
