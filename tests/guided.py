@@ -47,8 +47,17 @@ def objects_of(log: Log) -> pd.DataFrame:
 def library_beside(settings: ReconstructionSettings = SETTINGS) -> AssetLibrary:
     """An untrained library of another log, of chosen codes."""
     assets = pd.DataFrame(
-        [("other", f"car-{n}", "Car", 4.4 + 0.1 * n, 1.9, 1.6, 3) for n in range(4)],
-        columns=["log", "actor_id", "actor_class", "size_l", "size_w", "size_h", "observations"],
+        [("other", f"car-{n}", "Car", 4.4 + 0.1 * n, 1.9, 1.6, 3, "day") for n in range(4)],
+        columns=[
+            "log",
+            "actor_id",
+            "actor_class",
+            "size_l",
+            "size_w",
+            "size_h",
+            "observations",
+            "time_of_day",
+        ],
     )
     model = build_model(assets, ["other"], settings, seed=0)
     with torch.no_grad():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import math
@@ -400,6 +401,50 @@ def test_the_stage_leaves_a_library_that_can_be_adapted_again(
     learned = sum(p.numel() for name, p in made.model.named_parameters() if name.partition(".")[0] in LEARNED)
     assert counts["learned_parameters"] == learned < counts["parameters"]
     adapted_model(made, library.assets, ["tiny"], SETTINGS, "nearest", 0)
+
+
+def test_a_library_grows_by_the_logs_that_it_is_adapted_to(
+    inputs: Inputs, library: AssetLibrary, tmp_path: Path
+) -> None:
+    """What it had stays bit for bit, and what comes after is what adapting alone leaves."""
+    earlier = copy.deepcopy(library.model)
+    earlier.logs = ("earlier",)
+    before = AssetLibrary(
+        library.assets.assign(log="earlier"),
+        earlier,
+        library.settings,
+        {"earlier": library.scenes["tiny"]},
+        {"earlier": library.occupancy["tiny"]},
+    )
+    save_library(before, tmp_path / "before")
+    borrowing = Inputs(inputs.objects, {"reconstruct": tmp_path / "before"})
+    made = {}
+    for extend in (False, True):
+        work = tmp_path / f"work-{extend}"
+        work.mkdir()
+        out = tmp_path / f"out-{extend}"
+        reconstruct.run(borrowing, config(extend=extend), out, StageContext(0, None, work))
+        made[extend] = load_library(out)
+    alone, both = made[False], made[True]
+    expected = pd.concat((before.assets, alone.assets), ignore_index=True)
+    pd.testing.assert_frame_equal(both.assets, expected)
+    assert both.model.logs == ("earlier", "tiny") == tuple(both.scenes) == tuple(both.occupancy)
+    parts = (before.model, alone.model)
+    rows = [torch.cat(pair) for pair in zip(*(part.codes() for part in parts), strict=True)]
+    assert all(map(torch.equal, both.model.codes(), rows))
+    for name in OF_ACTORS:
+        assert torch.equal(getattr(both.model, name), torch.cat([getattr(part, name) for part in parts]))
+    for number, part in enumerate(parts):
+        state, own = both.model.backgrounds[number].state_dict(), part.backgrounds[0].state_dict()
+        assert all(torch.equal(state[name], own[name]) for name in own)
+    assert torch.equal(both.occupancy["tiny"].cells, alone.occupancy["tiny"].cells)
+    frozen, of_library = frozen_state(both.model), frozen_state(library.model)
+    assert all(torch.equal(frozen[name], of_library[name]) for name in of_library)
+
+
+def test_a_library_does_not_grow_by_a_log_that_it_has(inputs: Inputs, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match=r"adapt\.extend: the library has a log tiny already"):
+        reconstruct.run(inputs, config(extend=True), tmp_path / "out", StageContext(0, None, tmp_path))
 
 
 def test_the_stage_says_what_is_wrong_with_a_library(inputs: Inputs, tmp_path: Path) -> None:

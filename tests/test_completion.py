@@ -54,7 +54,7 @@ def rows(log: Log) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory: pytest.TempPathFactory) -> AssetPrior:
     """A prior of the library that tasks complete with."""
-    codes = library_codes(library_beside(), {"other": "day"})
+    codes = library_codes(library_beside())
     settings = TINY.model_copy(update={"held_out": 0.0, "looks": 0, "steps": 3})
     return learn(codes, tmp_path_factory.mktemp("prior"), settings).averaged
 
@@ -288,7 +288,7 @@ def test_the_evaluation_needs_a_library_and_truth(log: Log, tmp_path: Path) -> N
     library = library_beside()
     save_library(library, tmp_path / "library")
     (tmp_path / "log.json").write_text(json.dumps({"path": str(log.root)}))
-    codes = library_codes(library, {"other": "day"})
+    codes = library_codes(library)
     settings = TINY.model_copy(update={"held_out": 0.0, "looks": 0, "steps": 1})
     save_prior(learn(codes, tmp_path / "work", settings).averaged, codes.decoder, tmp_path)
     inputs = Inputs(
@@ -341,7 +341,7 @@ def test_contenders_are_measured_against_truth_at_equal_seconds(tmp_path: Path) 
     truth = open_truth(log.root)
     assert truth is not None
     library = library_beside()
-    codes = library_codes(library, {"other": "day"})
+    codes = library_codes(library)
     settings = TINY.model_copy(update={"held_out": 0.0, "looks": 0, "steps": 3})
     trained = learn(codes, tmp_path / "work", settings).averaged
     subject = Subject(log, objects_of(log), truth, library, trained)

@@ -44,6 +44,17 @@ def test_full_rank_covariances_agree_with_scipy(n: int, m: int) -> None:
     assert frechet_distance(*moments) == pytest.approx(expected, rel=1e-8)
 
 
+@pytest.mark.parametrize(("least", "within"), [(1e-1, 1e-13), (1e-6, 1e-11), (1e-9, 1e-8)])
+def test_covariances_with_common_axes_have_a_closed_form(least: float, within: float) -> None:
+    """Variances from 1 down to least^2: easy ones, and such that no root of an eigenvalue would be right for."""
+    generator = np.random.default_rng(6)
+    axes = np.linalg.qr(generator.normal(size=(60, 60)))[0]
+    deviations = [generator.permutation(np.geomspace(least, 1.0, 60)) for _ in range(2)]
+    sigmas = [(axes * deviation**2) @ axes.T for deviation in deviations]
+    found = frechet_distance(np.zeros(60), sigmas[0], np.zeros(60), sigmas[1])
+    assert found == pytest.approx(((deviations[0] - deviations[1]) ** 2).sum(), rel=within)
+
+
 def test_few_images_agree_with_covariances_of_low_rank() -> None:
     """n < d: factors of 5 and 9 rows against 40 x 40 matrices, and against one of each kind."""
     x, y = draws(5, 40, 3), draws(9, 40, 4)

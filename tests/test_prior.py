@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 import torch
 from safetensors.torch import load_file
-from tiny_prior import ACTORS, TIMES, TINY, codes_of, learn, make_library
+from tiny_prior import ACTORS, TINY, codes_of, learn, make_library
 from tiny_reconstruction import SETTINGS, changed
 
 from genassets.checkpoint import save_checkpoint
@@ -77,12 +77,17 @@ def test_codes_know_class_time_and_size(codes: LibraryCodes) -> None:
 
 
 def test_what_has_no_codes_or_no_time_is_refused(library: AssetLibrary) -> None:
-    with pytest.raises(StageError, match="time of day of log midnight is not known"):
-        library_codes(library, {"noon": "day"})
+    evening = library.assets.assign(time_of_day=["day"] * 8 + ["dusk"] * 5)
+    with pytest.raises(
+        StageError, match=r"actor car-0008 of log midnight is 'dusk' .* expected day or night"
+    ):
+        library_codes(replace(library, assets=evening))
+    with pytest.raises(StageError, match=r"time_of_day of actor car-0000 .* run the reconstruct stage again"):
+        library_codes(replace(library, assets=library.assets.drop(columns="time_of_day")))
     settings = changed(SETTINGS, model=SETTINGS.model.model_copy(update={"decoder": False}))
     planes = replace(library, model=build_model(library.assets, ["noon", "midnight"], settings, 0))
     with pytest.raises(StageError, match=r"reconstruct\.model\.decoder=false"):
-        library_codes(planes, TIMES)
+        library_codes(planes)
 
 
 def test_held_out_actors_leave_every_class_and_time_an_example(codes: LibraryCodes) -> None:

@@ -44,10 +44,19 @@ def make_library(actors: Sequence[tuple[str, str, tuple[float, float, float]]] =
     """A library of some actors: log, class and size of each."""
     assets = pd.DataFrame(
         [
-            (log, f"{name[:3].lower()}-{number:04d}", name, *size, 5)
+            (log, f"{name[:3].lower()}-{number:04d}", name, *size, 5, TIMES[log])
             for number, (log, name, size) in enumerate(actors)
         ],
-        columns=["log", "actor_id", "actor_class", "size_l", "size_w", "size_h", "observations"],
+        columns=[
+            "log",
+            "actor_id",
+            "actor_class",
+            "size_l",
+            "size_w",
+            "size_h",
+            "observations",
+            "time_of_day",
+        ],
     )
     logs = list(TIMES)
     model = build_model(assets, logs, SETTINGS, seed=0)
@@ -65,7 +74,7 @@ def make_library(actors: Sequence[tuple[str, str, tuple[float, float, float]]] =
 
 
 def codes_of(library: AssetLibrary) -> LibraryCodes:
-    return library_codes(library, TIMES)
+    return library_codes(library)
 
 
 def learn(codes: LibraryCodes, work_dir: Path, settings: PriorSettings = TINY, seed: int = 0) -> PriorTrainer:

@@ -52,7 +52,6 @@ def generate(
     from genassets.specs.document import parse_document
     from genassets.specs.validation import validate
     from genassets.stages import generate as stage
-    from genassets.stages.ingested import times_of_day
 
     wanted = {
         "count": count,
@@ -66,16 +65,13 @@ def generate(
     given = {name: value for name, value in wanted.items() if value is not None}
     config = validate(stage.GenerateConfig, given, parse_document(json.dumps(given), "command line"))
     record = run_of(Home.from_environment().runs, run, "train_prior")
-    ingested, library, prior = (
-        outputs_of(record, name, ADVICE) for name in ("ingest", "reconstruct", "train_prior")
-    )
+    library, prior = (outputs_of(record, name, ADVICE) for name in ("reconstruct", "train_prior"))
     name = "-".join([*(actor_class or "any").lower().split(), time or "any", f"seed{seed}"])
     directory = out or record.directory / FOLDER / name
     with appears_whole(directory) as partial:
         made = stage.generate(
             library[""],
             prior[""],
-            times_of_day(ingested.values()),
             config,
             seed,
             partial,

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import eigh
+from scipy.linalg.interpolative import estimate_spectral_norm
 from scipy.linalg.lapack import dpstrf
 from scipy.spatial.distance import cdist
 
@@ -24,15 +26,16 @@ NEIGHBOURS = 3
 ROUNDING = 1e-8
 """A covariance may be off symmetric, or have a negative eigenvalue, by this part of its largest one."""
 SQUARING = 1e-11
-"""What the sum of singular values may lose, relative to it, by taking them from the square of their matrix."""
+"""What a sum of singular values may lose, relative to it, by taking them as roots of eigenvalues."""
 
 
 def frechet_distance(mu1: ArrayLike, sigma1: ArrayLike, mu2: ArrayLike, sigma2: ArrayLike) -> float:
     """Squared Fréchet distance between two Gaussians with means (d,) and covariances (d, d).
 
-    |mu1 - mu2|^2 + tr(sigma1) + tr(sigma2) - 2 tr((sigma1 sigma2)^(1/2)). With sigma = factor' factor the last trace
-    is the sum of the singular values of factor1 factor2'. Factors are Cholesky's, with as many rows as sigma has
-    rank.
+    |mu1 - mu2|^2 + tr(sigma1) + tr(sigma2) - 2 tr((sigma1 sigma2)^(1/2)). The last trace is the sum of the roots of
+    the eigenvalues of sigma1 sigma2. Where these are too small for that, or sigma1 lacks rank, it is the sum of the
+    singular values of factor1 factor2' with sigma = factor' factor. Factors are Cholesky's, with as many rows as sigma
+    has rank.
 
     Raises:
         ValueError: shapes differ, a value is not finite, or a sigma is no covariance.
@@ -45,7 +48,11 @@ def frechet_distance(mu1: ArrayLike, sigma1: ArrayLike, mu2: ArrayLike, sigma2: 
             raise ValueError(
                 f"mean {mean.shape} and covariance {sigma.shape} must be ({size},) and ({size}, {size})"
             )
-    return _distance(means[0], _factor_of(sigmas[0]), means[1], _factor_of(sigmas[1]))
+    first, second = map(_covariance, sigmas)
+    shared = _sum_of_roots(first, second)
+    if shared is None:
+        shared = _sum_of_singular_values(_factor_of(first) @ _factor_of(second).T)
+    return _distance(means[0], means[1], float(np.trace(first) + np.trace(second)), shared)
 
 
 def frechet_distance_from_features(x: ArrayLike, y: ArrayLike) -> float:
@@ -60,7 +67,9 @@ def frechet_distance_from_features(x: ArrayLike, y: ArrayLike) -> float:
         ValueError: fewer than 2 rows, unequal widths, or a value that is not finite.
     """
     first, second = _features(x, y, least=2)
-    return _distance(*_mean_and_factor(first), *_mean_and_factor(second))
+    (mean1, factor1), (mean2, factor2) = map(_mean_and_factor, (first, second))
+    shared = _sum_of_singular_values(factor1 @ factor2.T)
+    return _distance(mean1, mean2, float((factor1**2).sum() + (factor2**2).sum()), shared)
 
 
 @dataclass(frozen=True)
@@ -155,18 +164,49 @@ def _mean_and_factor(features: Array) -> tuple[Array, Array]:
     return mean, factor
 
 
+def _covariance(sigma: Array) -> Array:
+    """A covariance without what rounding left unsymmetric.
+
+    Raises:
+        ValueError: the matrix is not finite, or not symmetric.
+    """
+    if not np.isfinite(sigma).all():
+        raise ValueError("a covariance holds values that are not finite")
+    if np.abs(sigma - sigma.T).max() > ROUNDING * np.abs(sigma).max():
+        raise ValueError("a covariance is symmetric; this matrix is not")
+    return np.asarray((sigma + sigma.T) / 2)
+
+
+def _sum_of_roots(sigma1: Array, sigma2: Array) -> float | None:
+    """Of the eigenvalues of sigma1 sigma2; None where sigma1 lacks rank, or rounding could cost more than SQUARING."""
+    try:
+        # Those of factor1 sigma2 factor1', which is symmetric.
+        values = eigh(sigma2, sigma1, eigvals_only=True, type=2, driver="gv", check_finite=False)
+    except np.linalg.LinAlgError:
+        return None
+    # Power iteration comes from below, by less than half.
+    largest = math.prod(2.0 * estimate_spectral_norm(sigma, its=5, rng=0) for sigma in (sigma1, sigma2))
+    return _roots_within(values, largest)
+
+
+def _roots_within(values: Array, largest: float) -> float | None:
+    """Sum of the roots of eigenvalues (n,), ascending, of a matrix whose terms are as large as `largest`; None where
+    rounding could cost it more than SQUARING.
+    """
+    if values[0] <= 0:
+        return None
+    total = float(np.sqrt(values).sum())
+    lost = math.sqrt(len(values)) * np.finfo(float).eps * largest * float((0.5 / np.sqrt(values)).sum())
+    return total if lost <= SQUARING * total else None
+
+
 def _factor_of(sigma: Array) -> Array:
     """A factor (rank, d) of a covariance, by Cholesky's method, with pivots where it lacks rank.
 
     Raises:
         ValueError: the matrix is no covariance.
     """
-    if not np.isfinite(sigma).all():
-        raise ValueError("a covariance holds values that are not finite")
     largest = float(np.abs(sigma).max())
-    if np.abs(sigma - sigma.T).max() > ROUNDING * largest:
-        raise ValueError("a covariance is symmetric; this matrix is not")
-    sigma = (sigma + sigma.T) / 2
     try:
         return np.asarray(np.linalg.cholesky(sigma).T)
     except np.linalg.LinAlgError:
@@ -179,26 +219,23 @@ def _factor_of(sigma: Array) -> Array:
     return factor
 
 
-def _distance(mean1: Array, factor1: Array, mean2: Array, factor2: Array) -> float:
+def _distance(mean1: Array, mean2: Array, traces: float, shared: float) -> float:
+    """From both covariances' traces, added, and the trace of the root of their product."""
     if not (np.isfinite(mean1).all() and np.isfinite(mean2).all()):
         raise ValueError("a mean holds values that are not finite")
-    traces = float((factor1**2).sum() + (factor2**2).sum())
-    shared = _sum_of_singular_values(factor1 @ factor2.T)
     # Rounding alone can bring the difference of equal sums below zero.
     return float(((mean1 - mean2) ** 2).sum()) + max(0.0, traces - 2.0 * shared)
 
 
 def _sum_of_singular_values(matrix: Array) -> float:
-    """From the eigenvalues of the square, in a third of the time, where what that costs the sum is within SQUARING."""
+    """From the eigenvalues of the square, in a third of the time, where rounding allows."""
     if len(matrix) > matrix.shape[1]:
         matrix = matrix.T
     if not matrix.any():
         return 0.0
-    values = np.sqrt(np.maximum(np.linalg.eigvalsh(matrix @ matrix.T), 0.0))
-    largest, total = values[-1], float(values.sum())
-    with np.errstate(divide="ignore"):
-        lost = math.sqrt(len(values)) * np.finfo(float).eps * largest**2 * float((0.5 / values).sum())
-    return total if lost <= SQUARING * total else float(np.linalg.svd(matrix, compute_uv=False).sum())
+    values = np.asarray(np.linalg.eigvalsh(matrix @ matrix.T), dtype=np.float64)
+    total = _roots_within(values, float(values[-1]))
+    return float(np.linalg.svd(matrix, compute_uv=False).sum()) if total is None else total
 
 
 def _mmd2(x: Array, y: Array) -> float:

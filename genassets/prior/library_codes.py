@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,11 +41,11 @@ class LibraryCodes:
         return counts.index_put(where, torch.ones(len(self), dtype=torch.long), accumulate=True)
 
 
-def library_codes(library: AssetLibrary, times: Mapping[str, str]) -> LibraryCodes:
-    """The codes of a library; times: "day" or "night" of each of its logs.
+def library_codes(library: AssetLibrary) -> LibraryCodes:
+    """The codes of a library.
 
     Raises:
-        StageError: the library has no codes (a model without decoder), or a log's time of day is not known.
+        StageError: the library has no codes (a model without decoder), or an actor's time of day is not known.
     """
     model = library.model
     if model.latent_log_variance is None:
@@ -54,20 +53,23 @@ def library_codes(library: AssetLibrary, times: Mapping[str, str]) -> LibraryCod
             "train_prior: the library was made with reconstruct.model.decoder=false, so it has planes and no latent "
             "codes; a prior learns codes: reconstruct with a decoder"
         )
-    logs = [str(log) for log in library.assets["log"]]
-    if missing := sorted(set(logs) - set(times)):
+    assets = library.assets
+    times = [str(time) for time in assets["time_of_day"]] if "time_of_day" in assets else [""] * len(assets)
+    if wrong := [row for row, time in enumerate(times) if time not in TIMES]:
+        asset = assets.iloc[wrong[0]]
         raise StageError(
-            f"train_prior: the time of day of log {', '.join(missing)} is not known; expected the logs of the "
-            f"library among those ingested: {', '.join(times)}"
+            f"train_prior: time_of_day of actor {asset['actor_id']} of log {asset['log']} is {times[wrong[0]]!r} "
+            f"in the library's assets.parquet; expected {' or '.join(TIMES)}. If an earlier version made the library, "
+            "run the reconstruct stage again."
         )
     with torch.no_grad():
-        latents = model.latents(torch.arange(len(logs)))
+        latents = model.latents(torch.arange(len(assets)))
     assert latents.log_variance is not None
     return LibraryCodes(
         latents.mean.clone(),
         torch.exp(0.5 * latents.log_variance),
         model.sizes.clone(),
-        Conditions.of(list(map(str, library.assets["actor_class"])), [times[log] for log in logs]),
+        Conditions.of(list(map(str, assets["actor_class"])), times),
         decoder_digest(model),
     )
 

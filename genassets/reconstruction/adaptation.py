@@ -87,6 +87,42 @@ def take_over(model: AssetModel, of_library: AssetModel) -> None:
     model.load_state_dict(model.state_dict() | frozen)
 
 
+def check_new_logs(library: AssetLibrary, logs: Sequence[str]) -> None:
+    """StageError where a library that is to be extended by some logs has one of that name."""
+    if known := sorted(set(logs) & set(library.model.logs)):
+        raise StageError(
+            f"reconstruct.adapt.extend: the library has a log {known[0]} already, and an actor is known by its log "
+            "and id; expected other logs. Rename the log, or set reconstruct.adapt.extend=false"
+        )
+
+
+@torch.no_grad()
+def extended(library: AssetLibrary, adapted: AssetLibrary) -> AssetLibrary:
+    """A library, and after its actors and logs those of one that was adapted from it, with the latter's settings."""
+    assets = pd.concat((library.assets, adapted.assets), ignore_index=True)
+    logs = [*library.model.logs, *adapted.model.logs]
+    model = build_model(assets, logs, adapted.settings, seed=0)
+    first, second = library.model.state_dict(), adapted.model.state_dict()
+    state = {}
+    for name, value in first.items():
+        of_actors = name.partition(".")[0] in (*OF_ACTORS, "latent_mean", "latent_log_variance")
+        state[name] = torch.cat((value, second[name])) if of_actors else value
+    for name, value in second.items():
+        part, _, rest = name.partition(".")
+        if part == "backgrounds":
+            number, _, parameter = rest.partition(".")
+            state[f"{part}.{len(library.model.logs) + int(number)}.{parameter}"] = value
+    model.load_state_dict(state)
+    model.eval()
+    return AssetLibrary(
+        assets,
+        model,
+        adapted.settings,
+        {**library.scenes, **adapted.scenes},
+        {**library.occupancy, **adapted.occupancy},
+    )
+
+
 def unknown_classes(library: pd.DataFrame, assets: pd.DataFrame) -> list[str]:
     """Classes of the assets that a library's table has no actor of."""
     return sorted(set(assets["actor_class"]) - set(library["actor_class"]))

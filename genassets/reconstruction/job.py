@@ -10,7 +10,7 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict
 
 from genassets.reconstruction.actor_colour import with_colours
-from genassets.reconstruction.adaptation import adapted_model, unknown_classes
+from genassets.reconstruction.adaptation import adapted_model, check_new_logs, extended, unknown_classes
 from genassets.reconstruction.latent_prior import LatentPull
 from genassets.reconstruction.library import load_library, make_library, save_library
 from genassets.reconstruction.model import AssetModel
@@ -24,7 +24,7 @@ from genassets.reconstruction.training_log import PreparedLogs
 class Job(BaseModel):
     """Where the prepared logs lie, where checkpoints and the library go, and how to learn.
 
-    library: that which is adapted, if any, from codes of `start`.
+    library: that which is adapted, if any, from codes of `start`; extend: the result holds its actors too.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -36,6 +36,7 @@ class Job(BaseModel):
     seed: int
     library: Path | None
     start: Literal["random", "class_mean", "nearest"]
+    extend: bool = False
     compute: ComputeSettings
 
     def run(
@@ -52,16 +53,18 @@ class Job(BaseModel):
         Every one of several processes calls this; the first writes the library into `out`.
         """
         data = PreparedLogs(self.prepared)
+        known = None if self.library is None else load_library(self.library)
+        if known is not None and self.extend:
+            check_new_logs(known, [log.scene.log_name for log in data])
         assets = with_colours(data.assets, data)
         names, counts = [log.scene.log_name for log in data], {"actors": len(assets)}
         pages = self._pages(processes)
-        if self.library is None:
+        if known is None:
             place = [] if pages is None else [pages.place]
             model = build_model(assets, names, self.settings, self.seed, *place)
         else:
-            library = load_library(self.library)
-            model = adapted_model(library, assets, names, self.settings, self.start, self.seed)
-            unknown = assets["actor_class"].isin(unknown_classes(library.assets, assets))
+            model = adapted_model(known, assets, names, self.settings, self.start, self.seed)
+            unknown = assets["actor_class"].isin(unknown_classes(known.assets, assets))
             counts["actors_of_classes_that_the_library_lacks"] = int(unknown.sum())
         model.to(processes.device)
         train(
@@ -80,6 +83,8 @@ class Job(BaseModel):
             library = make_library(
                 assets, model, self.settings, [d.scene for d in data], [d.occupancy for d in data]
             )
+            if known is not None and self.extend:
+                library = extended(known, library)
             save_library(library, self.out, *([] if pages is None else [pages.release]))
         counts["views"] = sum(len(d.views) for d in data)
         counts["parameters"] = sum(p.numel() for p in model.parameters())

@@ -201,6 +201,10 @@ class AdaptationSettings(_Settings):
         description="code that an actor begins with: a random one, the mean of the library's actors of its class, or "
         "that of the library's actor of its class that is nearest in size and colour",
     )
+    extend: bool = Field(
+        default=False,
+        description="the result holds the library's actors and logs, as they are, and after them the new ones",
+    )
     prior: Annotated[str, Field(min_length=1)] | None = Field(
         default=None,
         description="the prior that pulls at the codes, L_rend + prior_weight L_diff: a directory, a run or an "

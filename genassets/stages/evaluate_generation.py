@@ -78,7 +78,7 @@ def run(inputs: Inputs, config: EvaluateGenerationConfig, out: Path, context: St
 
     renderer = SceneRenderer.load(inputs.one("reconstruct"))
     times = times_of_day(inputs.shards("ingest").values())
-    codes = library_codes(renderer.library, times)
+    codes = library_codes(renderer.library)
     trained = load_prior(inputs.one("train_prior"))
     trained.check_decoder(codes.decoder, str(inputs.one("train_prior")))
     shards = {shard: open_ingested(place) for shard, place in inputs.shards("ingest").items()}

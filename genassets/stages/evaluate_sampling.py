@@ -44,10 +44,9 @@ def run(inputs: Inputs, config: EvaluateSamplingConfig, out: Path, context: Stag
     from genassets.prior.prior_file import load_prior
     from genassets.prior.sampling import draw_conditions
     from genassets.reconstruction.library import load_library
-    from genassets.stages.ingested import times_of_day
 
     library = load_library(inputs.one("reconstruct"))
-    codes = library_codes(library, times_of_day(inputs.shards("ingest").values()))
+    codes = library_codes(library)
     trained = load_prior(inputs.one("train_prior"))
     trained.check_decoder(codes.decoder, str(inputs.one("train_prior")))
     conditions = draw_conditions(trained.model, config.actors, None, None, context.seed)
@@ -98,12 +97,11 @@ STAGE = Stage(
     name="evaluate_sampling",
     version=1,
     config=EvaluateSamplingConfig,
-    needs=("ingest", "reconstruct", "train_prior"),
+    needs=("reconstruct", "train_prior"),
     modules=(
         "genassets.evaluation",
         "genassets.export",
         "genassets.prior",
-        "genassets.stages.ingested",
         *MODEL_CODE,
     ),
     run=run,

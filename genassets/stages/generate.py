@@ -53,24 +53,20 @@ class Generated:
 
 def run(inputs: Inputs, config: GenerateConfig, out: Path, context: StageContext) -> list[Metric]:
     """Generate with the experiment's seed."""
-    from genassets.stages.ingested import times_of_day
-
-    times = times_of_day(inputs.shards("ingest").values())
     places = inputs.one("reconstruct"), inputs.one("train_prior")
-    made = generate(*places, times, config, context.seed, out, context.progress)
+    made = generate(*places, config, context.seed, out, context.progress)
     return metrics(made, config)
 
 
 def generate(
     library: Path,
     prior: Path,
-    times: dict[str, str],
     config: GenerateConfig,
     seed: int,
     out: Path,
     progress: Callable[[float, float, str], None],
 ) -> Generated:
-    """Sample the prior of a library into `out`; times: "day" or "night" of the library's logs.
+    """Sample the prior of a library into `out`.
 
     Raises:
         SpecError: the prior knows no actor of the class or the time of day that is asked for.
@@ -86,7 +82,7 @@ def generate(
     from genassets.reconstruction.library import load_library, save_library
 
     learned = load_library(library)
-    codes = library_codes(learned, times)
+    codes = library_codes(learned)
     trained = load_prior(prior)
     trained.check_decoder(codes.decoder, str(prior))
     model = trained.model
@@ -199,12 +195,11 @@ STAGE = Stage(
     name="generate",
     version=1,
     config=GenerateConfig,
-    needs=("ingest", "reconstruct", "train_prior"),
+    needs=("reconstruct", "train_prior"),
     modules=(
         "genassets.prior",
         "genassets.evaluation",
         "genassets.export",
-        "genassets.stages.ingested",
         *MODEL_CODE,
     ),
     run=run,

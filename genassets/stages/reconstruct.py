@@ -66,6 +66,7 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
         seed=context.seed,
         library=inputs.borrowed["reconstruct"] if config.adapt else None,
         start=config.adapt.start if config.adapt else "random",
+        extend=config.adapt is not None and config.adapt.extend,
         compute=compute,
     )
     pull_of = None

@@ -30,10 +30,9 @@ def run(inputs: Inputs, config: TrainPriorConfig, out: Path, context: StageConte
     from genassets.prior.prior_file import save_prior
     from genassets.prior.training import train_prior
     from genassets.reconstruction.library import load_library
-    from genassets.stages.ingested import times_of_day
 
     library = load_library(inputs.one("reconstruct"))
-    codes = library_codes(library, times_of_day(inputs.shards("ingest").values()))
+    codes = library_codes(library)
     settings = PriorSettings.model_validate(config.model_dump())
     trainer = train_prior(codes, settings, context.seed, context.work_dir, context.progress, context.curve)
     save_prior(trainer.averaged, codes.decoder, out)
@@ -105,12 +104,11 @@ STAGE = Stage(
     name="train_prior",
     version=1,
     config=TrainPriorConfig,
-    needs=("ingest", "reconstruct"),
+    needs=("reconstruct",),
     modules=(
         "genassets.prior",
         "genassets.evaluation",
         "genassets.export",
-        "genassets.stages.ingested",
         *MODEL_CODE,
     ),
     run=run,
