@@ -21,6 +21,9 @@ log = logging.getLogger("genassets.perform")
 
 CURVE_POINTS = "_curves.jsonl"  # in the work directory, so that a resumed stage keeps its earlier points
 
+LOOKED = 1.0
+"""Seconds for which a look at the code is good enough to begin with."""
+
 
 @dataclass(frozen=True)
 class Outcome:
@@ -69,7 +72,8 @@ def perform(
         found = store.find(name, digest)
         if found is not None and not step.forced:
             return Outcome(found, cached=True)
-        workflow.check_code(step)
+        # Only spares work that the look after it would throw away; the step before may have looked just now.
+        workflow.check_code(step, checked_within=LOOKED)
         if found is None and name in workflow.selection.accept_code:
             return Outcome(_accepted(workflow, step, tree), cached=True)
         on_reason(reason_to_make(store, step, tree, found is not None))

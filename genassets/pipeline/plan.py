@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -103,6 +105,8 @@ class Workflow:
         self.stages = self._selected(self.catalog)
         self._logs: dict[str, str] = {}
         self._borrowed = dict(borrowed or {})
+        self._checked: dict[CodeRoots, float] = {}
+        """When modules on disk were last seen to be those of the fingerprints, by time.monotonic."""
 
     def _selected(self, catalog: tuple[Stage, ...]) -> tuple[Stage, ...]:
         selection = self.selection
@@ -190,15 +194,20 @@ class Workflow:
 
     def code_of(self, step: Step) -> dict[str, str]:
         """Digests of a step's modules as they were when this process first asked for them."""
-        self.pin_code()
-        return _CODE_OF_PROCESS[self._code_roots(step)]
+        roots = self._code_roots(step)
+        if roots not in _CODE_OF_PROCESS:
+            self.pin_code()
+        return _CODE_OF_PROCESS[roots]
 
-    def check_code(self, step: Step) -> None:
+    def check_code(self, step: Step, checked_within: float = 0.0) -> None:
         """Raise CodeChanged when a step's modules on disk are other than those that its fingerprint names.
 
-        Stages import when they run, so an edit would mix old modules with new ones.
+        Stages import when they run, so an edit would mix old modules with new ones. A look at the same modules that is
+        less than `checked_within` seconds ago is good enough.
         """
         roots = self._code_roots(step)
+        if time.monotonic() - self._checked.get(roots, -math.inf) < checked_within:
+            return
         now = self._code_on_disk([roots])[roots]
         changed = [name for name, _, _ in differences(self.code_of(step), now)]
         if changed:
@@ -207,6 +216,7 @@ class Workflow:
                 f"the code changed while the run was going: {shown} (below {SOURCE_ROOT}) is not what stage "
                 f"{step.stage.name} was planned with, so nothing of it is stored; start it again: genassets resume"
             )
+        self._checked[roots] = time.monotonic()
 
     def _code_roots(self, step: Step) -> CodeRoots:
         stage = step.stage

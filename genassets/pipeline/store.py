@@ -62,6 +62,7 @@ class Store:
 
     def __init__(self, root: Path) -> None:
         self.root = root
+        self._manifests: dict[str, tuple[int, StoredObject | None]] = {}
 
     def path_of(self, stage: str, fingerprint: str) -> Path:
         """Where an object lies or would lie."""
@@ -83,7 +84,19 @@ class Store:
 
     def all_of(self, stage: str) -> list[StoredObject]:
         """Complete objects of a stage, oldest first."""
-        return [stored for path in self.directories(stage) if (stored := _read_manifest(path)) is not None]
+        found = map(self._remembered, self._directories(stage))
+        return [stored for stored in found if stored is not None]
+
+    def _remembered(self, path: str) -> StoredObject | None:
+        """The manifest of a directory, read once: every step that is made looks at all objects of its stage."""
+        try:
+            written = os.stat(f"{path}/{MANIFEST}").st_mtime_ns  # noqa: PTH116 (a tenth of pathlib's time)
+        except OSError:
+            return None
+        known = self._manifests.get(path)
+        if known is None or known[0] != written:
+            known = self._manifests[path] = written, _read_manifest(Path(path))
+        return known[1]
 
     def stages(self) -> list[str]:
         """Stages that have objects."""
@@ -315,11 +328,19 @@ class Store:
 
     def directories(self, stage: str) -> list[Path]:
         """Directories of a stage's objects, oldest first, whether complete or not."""
+        return list(map(Path, self._directories(stage)))
+
+    def _directories(self, stage: str) -> list[str]:
         folder = self.root / "objects" / stage
         if not folder.is_dir():
             return []
-        found = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-        return sorted(found, key=lambda path: path.stat().st_mtime_ns)
+        with os.scandir(folder) as entries:
+            found = [
+                (entry.stat().st_mtime_ns, entry.path)
+                for entry in entries
+                if entry.is_dir() and not entry.name.startswith(".")
+            ]
+        return [path for _, path in sorted(found)]
 
     @staticmethod
     def _sweep(parent: Path, fingerprint: str) -> None:

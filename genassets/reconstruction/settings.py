@@ -197,7 +197,7 @@ class AdaptationSettings(_Settings):
         "run that made one is taken"
     )
     start: Literal["random", "class_mean", "nearest"] = Field(
-        default="nearest",
+        default="class_mean",
         description="code that an actor begins with: a random one, the mean of the library's actors of its class, or "
         "that of the library's actor of its class that is nearest in size and colour",
     )
