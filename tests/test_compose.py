@@ -153,11 +153,11 @@ def test_a_box_around_a_part_of_an_asset_is_where_that_part_is(wide: Log) -> Non
     length, width, height = CAR_SIZE
     part = np.array([[-length, -width, -height], [length, width, 3 * height]]) / 2
     high = standing(wide, 14.0, 0.0, z=height, size=(length, width, 2 * height))
-    seen = [
+    expected, seen = (
         sure(composed(wide, Edit(None, placed))).visible[NEW] for placed in (own, replace(high, part=part))
-    ]
-    assert seen[0].sum() > 100
-    np.testing.assert_array_equal(*seen)
+    )
+    assert expected.sum() > 100
+    np.testing.assert_array_equal(seen, expected)
 
 
 def test_a_large_asset_is_rendered_no_larger_than_allowed(wide: Log) -> None:
