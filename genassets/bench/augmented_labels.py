@@ -130,10 +130,10 @@ def measure(
             say(f"log {seed}: {camera}")
             judged += judge(swapped, camera, renderer, meshes)
     ious = {
-        "placed boxes, masks of assets": [one.fit.iou for one in judged],
-        "whole boxes, the same masks": [one.whole_box for one in judged],
-        "whole boxes, true meshes there": [one.true_mesh for one in judged],
-        "boxes and true masks of the learned log": recorded_ious(recorded),
+        "placed boxes, masks of assets": [(one.fit.iou, one.fit.cut) for one in judged],
+        "whole boxes, the same masks": [(one.whole_box, one.fit.cut) for one in judged],
+        "whole boxes, true meshes there": [(one.true_mesh, one.fit.cut) for one in judged],
+        "boxes and true masks of the learned log": [(fit.iou, fit.cut) for fit in recorded_fits(recorded)],
     }
     in_space: dict[str, str | int | float] = {
         "boxes in 3D": len(gaps),
@@ -226,14 +226,14 @@ def open_recorded(source: Path, library: AssetLibrary) -> Recorded:
     return Recorded(log, truth, {track.actor_id: _true_id(truth, track) for track in learned})
 
 
-def recorded_ious(recorded: Recorded) -> list[float]:
-    """IoUs of the unoccluded boxes of a library's own actors with their true masks."""
+def recorded_fits(recorded: Recorded) -> list[Fit]:
+    """The unoccluded boxes of a library's own actors with their true masks."""
     import numpy as np
 
     from genassets.bench.label_fit import box_fits
 
     log, truth = recorded.log, recorded.truth
-    found = []
+    found: list[Fit] = []
     for camera in log.cameras:
         for frame in range(log.frame_count):
             instances, depth = truth.instances(camera, frame), truth.depth(camera, frame)
@@ -241,7 +241,7 @@ def recorded_ious(recorded: Recorded) -> list[float]:
                 actor: instances == truth.instance_of[true_id] for actor, true_id in recorded.true_ids.items()
             }
             before = np.where(depth == 0, np.float32(np.inf), depth)
-            found += [fit.iou for fit in box_fits(log, camera, frame, masks, before)]
+            found += box_fits(log, camera, frame, masks, before)
     return found
 
 
@@ -317,15 +317,19 @@ def _true_id(truth: Truth, track: Track) -> str:
     return next(uuid for uuid in track.uuids if uuid in truth.instance_of)
 
 
-def _row(name: str, ious: Sequence[float]) -> dict[str, str | int | float]:
+def _row(name: str, fits: Sequence[tuple[float, bool]]) -> dict[str, str | int | float]:
+    """IoUs of boxes, and whether the image's edge cuts them off, in numbers."""
     import numpy as np
 
-    values = np.array(ious)
-    row: dict[str, str | int | float] = {"IoU with": name, "boxes in images": len(ious)}
-    row["share of at least 0.8"] = round(float((values >= GOOD_IOU).mean()), 4) if ious else ""
-    for text, quantile in (("5 %", 0.05), ("median", 0.5)):
-        row[text] = round(float(np.quantile(values, quantile)), 3) if ious else ""
-    row["0"] = int((values == 0).sum())
+    ious, cut = np.array([iou for iou, _ in fits]), np.array([cut for _, cut in fits], dtype=bool)
+    row: dict[str, str | int | float] = {"IoU of": name}
+    for text, chosen in (("whole in the image", ious[~cut]), ("cut off", ious[cut])):
+        row[f"{text}: boxes"] = len(chosen)
+        good = (chosen >= GOOD_IOU).mean() if len(chosen) else np.nan
+        low, middle = np.quantile(chosen, (0.05, 0.5)) if len(chosen) else (np.nan, np.nan)
+        for what, value in (("at least 0.8", good), ("5 %", low), ("median", middle)):
+            row[f"{text}: {what}"] = round(float(value), 3)
+        row[f"{text}: 0"] = int((chosen == 0).sum())
     return row
 
 

@@ -27,9 +27,13 @@ BEFORE = 0.1
 
 @dataclass(frozen=True)
 class Fit:
-    """An unoccluded box: its bounds in the image, those of its actor's mask, and their IoU; 0 where that is empty."""
+    """An unoccluded box: its bounds in the image, those of its actor's mask, and their IoU; 0 where that is empty.
+
+    cut: whether the image's edge cuts the box off.
+    """
 
     actor_id: str
+    cut: bool
     bounds: Bounds
     mask: Bounds | None
     iou: float
@@ -66,7 +70,8 @@ def box_fits(
             continue
         mask = visible[track.actor_id]
         own = bounds_of_mask(mask) if mask.any() else None
-        found.append(Fit(track.actor_id, box.bounds, own, 0.0 if own is None else iou(box.bounds, own)))
+        fit = 0.0 if own is None else iou(box.bounds, own)
+        found.append(Fit(track.actor_id, box.truncation > 0, box.bounds, own, fit))
     return found
 
 
