@@ -40,11 +40,12 @@ def box_body(size: Sequence[float] | NDArray[np.float64]) -> Body:
     """A body that fills its box."""
     box = trimesh.creation.box(extents=np.asarray(size))
     mesh = SurfaceMesh(np.asarray(box.vertices), np.asarray(box.faces), True, 1.0)
-    return Body.of_mesh(mesh, np.asarray(size, dtype=np.float64))
+    return Body.of_mesh(mesh)
 
 
 def box_bodies(assets: Assets = ASSETS) -> dict[int, Body]:
-    return {row: box_body(assets.size(row)) for row in range(len(assets.table))}
+    sizes = assets.table[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
+    return {row: box_body(size) for row, size in enumerate(sizes)}
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import cast
 
 import numpy as np
 import pandas as pd
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from genassets.geometry.boxes import intersect_box
 from genassets.geometry.cameras import Intrinsics, pixel_centres, pixel_directions
@@ -51,6 +51,11 @@ class BoxRenderer:
         alpha = ((near < far) & (far > 0)).astype(np.float32).reshape(height, width)
         depth = np.where(alpha > 0, np.maximum(near, 0).reshape(height, width), 0).astype(np.float32)
         return ActorView(alpha[..., None] * np.array(self.colour, dtype=np.float32), alpha, depth)
+
+    def actor_opacity(
+        self, log_name: str, actor_id: str, intrinsics: Intrinsics, box_from_camera: ArrayLike
+    ) -> NDArray[np.float32]:
+        return self.render_actor(log_name, actor_id, intrinsics, box_from_camera).alpha
 
 
 def box_renderer(*sizes: tuple[float, float, float]) -> SceneRenderer:

@@ -11,11 +11,14 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from augmented import ASSETS, CAR, VAN, Painter, box_bodies, box_body, table
+from augmented import ASSETS, BUS, CAR, VAN, Painter, box_bodies, table
+from box_renderer import box_renderer
 from tiny_log import CONE, MOVING, MOVING_TWIN, PARKED, WALKER, build_tiny_log
 
 from genassets.augmentation.assets import Assets
 from genassets.augmentation.augment_log import Augmented, augment_log, augmented_name
+from genassets.augmentation.compose import Composer
+from genassets.augmentation.compose_settings import ComposeSettings
 from genassets.augmentation.composers import KeptImages
 from genassets.augmentation.edits import Edit
 from genassets.augmentation.plan import plan_variant
@@ -366,10 +369,32 @@ def test_one_frame_is_in_memory_at_a_time(source: Log, tmp_path: Path) -> None:
 
     plan = plan_variant(source, ASSETS, box_bodies().__getitem__, settings(), 5, 1)
     edits = [planned.edit for planned in plan.edits]
-    variant = Variant(
-        source, edits, lambda row: box_body(ASSETS.size(row)), Painter(source, edits), settings(), 5
-    )
+    variant = Variant(source, edits, box_bodies().__getitem__, Painter(source, edits), settings(), 5)
     for frame in range(FRAMES):
         made = variant.frame(frame, Counter())
         assert isinstance(made, Iterator)
         assert [file.path.split("/")[0] for file in made] == ["lidar", "annotations", "camera", "camera"]
+
+
+def test_memory_does_not_grow_with_the_length_of_the_log(tmp_path: Path) -> None:
+    """Six frames more, composed and written, need less than one image more at their peak.
+
+    Nine fill what is kept of the frames around: eight images, and six sweeps at this setting.
+    """
+    import tracemalloc
+
+    def composer(log: Log, edits: Sequence[Edit]) -> ImageComposer:
+        return Composer(log, box_renderer(CAR, VAN, BUS), edits, ComposeSettings(reach=1, sweeps=3))
+
+    def peak(frames: int) -> int:
+        root = build_tiny_log(tmp_path / f"of-{frames}", frames, ("front_camera",), 320, 180)
+        log = steady_heights(open_log(root))
+        tracemalloc.start()
+        try:
+            augment(log, tmp_path / f"out-{frames}", composer, cameras=("front_camera",))
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    peak(2)  # what is imported and kept for good
+    assert peak(15) < peak(9) + 320 * 180 * 3

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from augmented import ASSETS, BUS, CAR, OWN, VAN, box_bodies, box_body, table
+from augmented import ASSETS, BUS, CAR, OWN, VAN, box_bodies, table
 from pydantic import ValidationError
 from tiny_log import CAR_SIZE, CONE, MOVING, PARKED, WALKER, build_tiny_log
 
@@ -255,10 +255,9 @@ def test_scenario_edits_that_cannot_be_say_why(log: Log, values: dict[str, Any],
 
 def test_a_turn_into_another_box_is_refused(tmp_path: Path) -> None:
     log = open_log(build_tiny_log(tmp_path / "tiny", frames=3))
-    long = replace(log.track(PARKED), size=np.array([14.0, 1.9, 1.6]))
-    log = replace(log, tracks=tuple(long if t.actor_id == PARKED else t for t in log.tracks))
+    long = Assets.of("own", table(("tiny", PARKED, "Car", (14.0, 1.9, 1.6))), {"tiny": "day"})
     with pytest.raises(SpecError, match="turned by 90 degrees.*meets another box"):
-        plan(log, WITH_OWN, fraction=0.0, rotate=({"actor": PARKED, "degrees": 90.0},))
+        plan(log, long, fraction=0.0, rotate=({"actor": PARKED, "degrees": 90.0},))
 
 
 @pytest.mark.parametrize(
@@ -280,11 +279,16 @@ def test_a_camera_that_the_log_lacks_is_named(tmp_path: Path) -> None:
         plan(log, cameras=("back_camera",))
 
 
-def test_assets_that_do_not_reach_the_ground_are_counted(log: Log) -> None:
-    high = box_body(CAR)
-    high = replace(high, bounds=high.bounds + np.array([[0.0, 0.0, 0.06], [0.0, 0.0, 0.0]]))
-    bodies = {0: high, 1: BODIES[1], 2: BODIES[2]}
-    made = [plan(log, seed=seed, bodies=bodies.__getitem__) for seed in range(8)]
-    rows = [[e.edit.placed.row for e in p.edits if e.edit.placed] for p in made]
-    assert [p.counts()["assets_floating"] for p in made] == [of_plan.count(0) for of_plan in rows]
-    assert high.gap(np.array([4.2, 1.8, 3.0])) == pytest.approx(0.12), "stretched, it floats higher"
+def test_a_placed_box_is_that_of_the_surface_and_stands_on_the_ground(log: Log) -> None:
+    """A car without its rear half metre and 7 cm of its wheels: neither box nor ground contact is where they were."""
+    bounds = np.array([[-1.6, -0.9, -0.68], [2.1, 0.9, 0.75]])
+    bodies = {**BODIES, 0: replace(BODIES[0], bounds=bounds)}
+    made = [e.edit for s in range(8) for e in plan(log, seed=s, bodies=bodies.__getitem__).edits]
+    short = [(e.removed, e.placed) for e in made if e.placed is not None and e.placed.row == 0]
+    assert short
+    for removed, asset in short:
+        assert removed is not None and asset.part is not None
+        assert np.array_equal(asset.part, bounds)
+        assert asset.track.size == pytest.approx([3.7, 1.8, 1.43])
+        bottoms = [t.world_from_box[:, 2, 3] - t.size[2] / 2 for t in (removed, asset.track)]
+        assert bottoms[0] == pytest.approx(bottoms[1], abs=1e-12)

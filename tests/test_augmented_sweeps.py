@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from augmented import box_bodies, box_body
 from numpy.typing import NDArray
 from tiny_log import MOVING, PARKED, build_tiny_log
 
+from genassets.augmentation.bodies import Body
 from genassets.augmentation.changed_sweep import change_sweep, pose_seen
 from genassets.augmentation.edits import Edit, PlacedAsset
 from genassets.augmentation.ground import ground_around
@@ -21,6 +23,7 @@ from genassets.augmentation.settings import LidarSettings
 from genassets.driving import Log, open_log
 from genassets.driving.sweep import FORWARD, SPINNING, read_returns
 from genassets.driving.synthetic.rig import SPINNING_ELEVATIONS
+from genassets.export.mesh import SurfaceMesh
 from genassets.geometry.transforms import make_pose, transform_points, yaw_pose
 
 EYE = np.array([0.0, 0.0, 2.0])
@@ -104,6 +107,19 @@ def test_a_stretched_body_is_met_at_its_new_size() -> None:
     body = BodyAt(box_body(SIZE), standing(10.0, 0.0, 2 * SIZE), 2 * SIZE)
     changed = change_beams(on_flat_ground(ahead(0.1)), [], [body], [], True)
     assert changed.lengths[0] * ahead(0.1)[0, 0] == pytest.approx(6.0, abs=1e-5)  # its rear, at 10 - 4
+
+
+def test_a_surface_beside_the_middle_of_its_box_is_met_where_it_is() -> None:
+    """The box that is placed is the surface's own, so what is met is what a centred surface would be."""
+    box = trimesh.creation.box(extents=SIZE)
+    mesh = SurfaceMesh(np.asarray(box.vertices) + [0.4, -0.1, 0.2], np.asarray(box.faces), True, 1.0)
+    beams = on_flat_ground(ahead(0.1))
+    centred, beside = (
+        change_beams(beams, [], [BodyAt(body, standing(10.0, 0.0), 1.5 * SIZE)], [], True)
+        for body in (box_body(SIZE), Body.of_mesh(mesh))
+    )
+    assert (centred.placed >= 0).any()
+    assert beside.lengths == pytest.approx(centred.lengths, abs=1e-5)
 
 
 def test_returns_of_a_neighbour_are_not_taken_for_a_removed_actor() -> None:

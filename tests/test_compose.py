@@ -147,6 +147,19 @@ def test_an_asset_is_stretched_to_the_size_it_is_drawn_at(wide: Log) -> None:
     assert not (found.visible[NEW] & ~hull(wide, large.track)).any()
 
 
+def test_a_box_around_a_part_of_an_asset_is_where_that_part_is(wide: Log) -> None:
+    """A box twice as high, of which the asset's own is the lower half, shows it where its own box would."""
+    own = standing(wide, 14.0, 0.0)
+    length, width, height = CAR_SIZE
+    part = np.array([[-length, -width, -height], [length, width, 3 * height]]) / 2
+    high = standing(wide, 14.0, 0.0, z=height, size=(length, width, 2 * height))
+    expected, seen = (
+        sure(composed(wide, Edit(None, placed))).visible[NEW] for placed in (own, replace(high, part=part))
+    )
+    assert expected.sum() > 100
+    np.testing.assert_array_equal(seen, expected)
+
+
 def test_a_large_asset_is_rendered_no_larger_than_allowed(wide: Log) -> None:
     renderer = box_renderer(CAR_SIZE)
     settings = ComposeSettings(render_pixels=256)

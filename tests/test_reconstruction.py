@@ -256,6 +256,15 @@ def test_an_actor_alone_fills_its_middle_and_nothing_else(renderer: SceneRendere
     assert distance - CAR_SIZE[0] / 2 < view.depth[32, 32] < distance
 
 
+def test_the_opacity_of_an_actor_is_that_of_its_picture(renderer: SceneRenderer) -> None:
+    intrinsics, box_from_camera = turntable_camera(CAR_SIZE, 30.0, resolution=64)
+    near = intrinsics.cropped(20, 11, 51, 40)  # its edge cuts the car
+    view = renderer.render_actor("tiny", PARKED, near, box_from_camera)
+    opacity = renderer.actor_opacity("tiny", PARKED, near, box_from_camera)
+    assert opacity[:, 0].max() > 0.1
+    np.testing.assert_allclose(opacity, view.alpha, atol=1e-6)
+
+
 @pytest.mark.parametrize("actor", [PARKED, MOVING, WALKER])
 def test_the_surface_of_an_actor_closes_inside_its_label(renderer: SceneRenderer, actor: str) -> None:
     resolution = 33

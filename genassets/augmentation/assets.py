@@ -7,11 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from genassets.errors import StageError
-
-SIZES = ["size_l", "size_w", "size_h"]
 
 
 @dataclass(frozen=True)
@@ -33,10 +30,6 @@ class Assets:
         else:
             times = [times_of_logs.get(str(log), "") for log in table["log"]]
         return cls(name, table.reset_index(drop=True), tuple(times))
-
-    def size(self, row: int) -> NDArray[np.float64]:
-        """Length, width and height (3,) in metres."""
-        return self.table.loc[row, SIZES].to_numpy(dtype=np.float64)
 
     def identity(self, row: int) -> tuple[str, str]:
         """The log that an asset is from and its actor id there."""

@@ -24,27 +24,29 @@ KEPT = 256
 
 @dataclass(frozen=True)
 class Body:
-    """An asset's surface in its box frame, with the size (3,) of that box in metres and the surface's bounds (2, 3)."""
+    """An asset's surface in the frame of the asset's box, and its bounds there: lowest and highest corner (2, 3)."""
 
     scene: Any
-    size: Array
     bounds: Array
 
     @classmethod
-    def of_mesh(cls, mesh: SurfaceMesh, size: Array) -> Body:
-        bounds = np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)])
-        return cls(ray_scene(mesh), np.asarray(size, dtype=np.float64), bounds)
+    def of_mesh(cls, mesh: SurfaceMesh) -> Body:
+        return cls(ray_scene(mesh), np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]))
+
+    @property
+    def size(self) -> Array:
+        """Length, width and height (3,) of the surface in metres."""
+        return np.asarray(self.bounds[1] - self.bounds[0])
 
     def meets(self, origins: Array, directions: Array, size: Array) -> Array:
-        """How far (N,) rays (N, 3) of the box frame go, in lengths of their directions, until they meet the body
-        stretched to a box of another size; infinite where they miss it.
+        """How far rays go until they meet the body, stretched to a size.
+
+        origins and directions (N, 3) in the frame of the box around the body; distances (N,) in lengths of the
+        directions, infinite where a ray misses it.
         """
         scale = self.size / np.asarray(size, dtype=np.float64)
-        return np.asarray(cast(self.scene, origins * scale, directions * scale)[0], dtype=np.float64)
-
-    def gap(self, size: Array) -> float:
-        """Metres between the box's lower face and the lowest point of the body stretched to a size."""
-        return float((self.bounds[0, 2] + self.size[2] / 2) * size[2] / self.size[2])
+        from_middle = origins * scale + self.bounds.mean(axis=0)
+        return np.asarray(cast(self.scene, from_middle, directions * scale)[0], dtype=np.float64)
 
 
 Bodies = Callable[[int], Body]
@@ -66,6 +68,6 @@ def library_bodies(renderer: SceneRenderer, resolution: int) -> Bodies:
             MOST_TRIANGLES,
             f"asset {row} ({actor} of log {log})",
         )
-        return Body.of_mesh(made.mesh, size)
+        return Body.of_mesh(made.mesh)
 
     return body

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+
 from genassets.driving.log import Track
 
 
@@ -12,11 +16,13 @@ class PlacedAsset:
     """An asset of a library that stands in a log.
 
     row: its row in the library's table. track: where it is at each frame, in the log's world; its actor_id is new to
-    the log, its size that at which the asset is drawn, in metres.
+    the log. part: lowest and highest corner of that part of the asset's own box, in its frame, which the track's box
+    encloses and is the size of, unless the asset is stretched; by default the whole.
     """
 
     row: int
     track: Track
+    part: Float[NDArray[np.float64], "2 3"] | None = None
 
 
 @dataclass(frozen=True)

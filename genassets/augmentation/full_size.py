@@ -49,10 +49,13 @@ def render_layer(
     An asset that is drawn larger or smaller than it is in the library is stretched along its box's axes.
     """
     asset = renderer.assets.iloc[placed.row]
-    stretch = placed.track.size / asset[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
+    whole = asset[["size_l", "size_w", "size_h"]].to_numpy(dtype=np.float64)
+    lowest, highest = (-whole / 2, whole / 2) if placed.part is None else placed.part
     camera_from_box = shot.camera_from_box(placed.track)
     # Directions come out stretched too, so that steps along rays stay metres of the world.
-    box_from_camera = np.diag([*(1 / stretch), 1.0]) @ invert_pose(camera_from_box)
+    shrunk = np.diag([*((highest - lowest) / placed.track.size), 1.0])
+    shrunk[:3, 3] = (lowest + highest) / 2
+    box_from_camera = shrunk @ invert_pose(camera_from_box)
     window = shot.intrinsics.cropped(*region)
     scale = min(
         settings.render_scale, math.sqrt(settings.render_pixels / (window.width * window.height)), 1.0

@@ -119,8 +119,8 @@ class Outlines:
         scale = min(1.0, (SILHOUETTE_PIXELS / (seen.width * seen.height)) ** 0.5)
         small = seen.resized(max(1, round(seen.width * scale)), max(1, round(seen.height * scale)))
         pose = invert_pose(shot.camera_from_box(track))
-        view = self._renderer.render_actor(self._log.name, actor_id, small, pose)
-        alpha = cv2.resize(view.alpha, (seen.width, seen.height), interpolation=cv2.INTER_LINEAR)
+        opacity = self._renderer.actor_opacity(self._log.name, actor_id, small, pose)
+        alpha = cv2.resize(opacity, (seen.width, seen.height), interpolation=cv2.INTER_LINEAR)
         return region, np.asarray(alpha, dtype=np.float32)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from genassets.augmentation.assets import Assets
-from genassets.augmentation.bodies import Bodies
+from genassets.augmentation.bodies import Bodies, Body
 from genassets.augmentation.collisions import Surroundings
 from genassets.augmentation.edits import Edit, PlacedAsset
 from genassets.augmentation.ground import ground_around
@@ -26,8 +26,6 @@ from genassets.geometry.transforms import heading_of, invert_pose, transform_poi
 
 Origin = Literal["swapped", "inserted", "rotated", "removed"]
 
-FLOATING = 0.05
-"""Metres."""
 TRIES = 24
 """Assets that are tried for an actor before it is left alone."""
 
@@ -45,15 +43,13 @@ class Plan:
     """The edits of one variant of a log.
 
     eligible: how many actors may be swapped. left_alone: how many that were to be swapped were not, by reason.
-    retried: how many assets gave way to the next one, for they would have met something or have no surface. floating:
-    how many placed assets have no point within FLOATING of the ground contact.
+    retried: how many assets gave way to the next one, for they would have met something or have no surface.
     """
 
     edits: tuple[PlannedEdit, ...]
     eligible: int
     left_alone: Mapping[str, int]
     retried: int
-    floating: int
 
     def counts(self) -> dict[str, int]:
         """What was planned, in numbers of actors and assets."""
@@ -63,7 +59,6 @@ class Plan:
             "actors_eligible": self.eligible,
             **{f"actors_left_alone_{reason.replace(' ', '_')}": n for reason, n in self.left_alone.items()},
             "assets_retried": self.retried,
-            "assets_floating": self.floating,
         }
 
 
@@ -72,12 +67,15 @@ def plan_variant(
 ) -> Plan:
     """The edits of a variant (1, 2, ..): those that the settings name, then swaps of what is left.
 
+    A placed box is that of the asset's surface: what was not learned of an actor, its unseen end or its wheels, is not
+    drawn either, so that the actor's own box would show what is not there, and some assets would float.
+
     The same seed gives the same plan; which asset an actor gets does not hang on the other actors, save where boxes
     would meet.
 
     Raises:
         SpecError: the settings name an actor or asset that there is not, or a pose that another box takes.
-        StageError: the library has no asset of a class, or of the log's time of day.
+        StageError: the library has no asset of a class, or of the log's time of day, or a named one has no surface.
     """
     identity = f"{log.name}/{seed}/{variant}"
     surroundings = Surroundings(log)
@@ -89,10 +87,12 @@ def plan_variant(
         edits.append(PlannedEdit(Edit(track, None), "removed"))
     for rotation in settings.rotate:
         track = _named(log, rotation.actor, "rotate", touched)
-        edits.append(_rotated(track, rotation, log, assets, surroundings, identity))
+        edits.append(_rotated(track, rotation, log, assets, bodies, surroundings, identity))
     for number, insertion in enumerate(settings.insert):
         rng = np.random.default_rng([seed, variant, number])
-        edits.append(_inserted(insertion, log, assets, settings, surroundings, f"{identity}/{number}", rng))
+        edits.append(
+            _inserted(insertion, log, assets, bodies, settings, surroundings, f"{identity}/{number}", rng)
+        )
     eligible, retried = 0, 0
     left_alone: dict[str, int] = {}
     if settings.fraction:
@@ -100,9 +100,7 @@ def plan_variant(
             log, assets, bodies, settings, surroundings, touched, identity, (seed, variant)
         )
         edits += swaps
-    placed = [planned.edit.placed for planned in edits if planned.edit.placed is not None]
-    floating = sum(bodies(asset.row).gap(asset.track.size) > FLOATING for asset in placed)
-    return Plan(tuple(edits), eligible, left_alone, retried, floating)
+    return Plan(tuple(edits), eligible, left_alone, retried)
 
 
 def eligible_tracks(log: Log, assets: Assets, settings: AugmentSettings) -> list[Track]:
@@ -151,15 +149,17 @@ def _swaps(
             left_alone["no asset"] += 1
             continue
         for row in [rows[i] for i in own.permutation(len(rows))[:TRIES]]:
-            size = track.size if settings.size == "fitted" else assets.size(row)
-            placed = in_place_of(
-                track, assets.actor_class(row), size, f"{identity}/{'/'.join(assets.identity(row))}"
-            )
-            if not surroundings.blocks(placed, without=track.actor_id) and _has_body(bodies, row):
-                surroundings.remove(track.actor_id)
-                surroundings.add(placed)
-                edits.append(PlannedEdit(Edit(track, PlacedAsset(row, placed)), "swapped"))
-                break
+            body = _body(bodies, row)
+            if body is not None:
+                size = track.size if settings.size == "fitted" else body.size
+                placed = in_place_of(
+                    track, assets.actor_class(row), size, f"{identity}/{'/'.join(assets.identity(row))}"
+                )
+                if not surroundings.blocks(placed, without=track.actor_id):
+                    surroundings.remove(track.actor_id)
+                    surroundings.add(placed)
+                    edits.append(PlannedEdit(Edit(track, PlacedAsset(row, placed, body.bounds)), "swapped"))
+                    break
             retried += 1
         else:
             left_alone["no asset fits"] += 1
@@ -186,12 +186,11 @@ def _seen(log: Log, track: Track, cameras: Collection[str]) -> bool:
     return False
 
 
-def _has_body(bodies: Bodies, row: int) -> bool:
+def _body(bodies: Bodies, row: int) -> Body | None:
     try:
-        bodies(row)
+        return bodies(row)
     except StageError:
-        return False
-    return True
+        return None
 
 
 def _named(log: Log, actor: str, key: str, touched: set[str]) -> Track:
@@ -209,7 +208,13 @@ def _named(log: Log, actor: str, key: str, touched: set[str]) -> Track:
 
 
 def _rotated(
-    track: Track, rotation: Rotation, log: Log, assets: Assets, surroundings: Surroundings, identity: str
+    track: Track,
+    rotation: Rotation,
+    log: Log,
+    assets: Assets,
+    bodies: Bodies,
+    surroundings: Surroundings,
+    identity: str,
 ) -> PlannedEdit:
     row = assets.row_of(log.name, track.actor_id)
     if row is None:
@@ -217,7 +222,8 @@ def _rotated(
             f"rotate: {assets.name}: the library has no asset of actor {rotation.actor} of log {log.name}, which it "
             "would be drawn with; use a library that was learned from this log, or swap the actor"
         )
-    placed = in_place_of(track, track.actor_class, track.size, identity, rotation.degrees)
+    body = bodies(row)
+    placed = in_place_of(track, track.actor_class, body.size, identity, rotation.degrees)
     if surroundings.blocks(placed, without=track.actor_id):
         raise SpecError(
             f"rotate: turned by {rotation.degrees:g} degrees, actor {rotation.actor} of log {log.name} meets another "
@@ -225,13 +231,14 @@ def _rotated(
         )
     surroundings.remove(track.actor_id)
     surroundings.add(placed)
-    return PlannedEdit(Edit(track, PlacedAsset(row, placed)), "rotated")
+    return PlannedEdit(Edit(track, PlacedAsset(row, placed, body.bounds)), "rotated")
 
 
 def _inserted(
     insertion: Insertion,
     log: Log,
     assets: Assets,
+    bodies: Bodies,
     settings: AugmentSettings,
     surroundings: Surroundings,
     identity: str,
@@ -249,7 +256,8 @@ def _inserted(
             yaw_pose(heading_of(log.world_from_ego[0]), log.world_from_ego[0, :3, 3]), place
         )
         heading += float(heading_of(log.world_from_ego[0]))
-    size = assets.size(row)
+    body = bodies(row)
+    size = body.size
     place[2] = (
         _ground_height(log, place, heading, size, range(first, last + 1))
         if insertion.z is None
@@ -261,7 +269,7 @@ def _inserted(
     if surroundings.blocks(track):
         raise SpecError(f"{where}: the asset's box meets another; choose another pose, frames or asset")
     surroundings.add(track)
-    return PlannedEdit(Edit(None, PlacedAsset(row, track)), "inserted")
+    return PlannedEdit(Edit(None, PlacedAsset(row, track, body.bounds)), "inserted")
 
 
 def _asset_to_insert(

@@ -1,4 +1,4 @@
-"""Composing swapped actors into images, beside rendering whole frames: seconds, error to the true picture, labels."""
+"""Composing swapped actors into images, beside rendering whole frames: seconds, error to the true picture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from genassets.augmentation.compose import ComposedImage
     from genassets.augmentation.edits import Edit
     from genassets.city_spec import CitySpec
-    from genassets.driving.log import Log, Track
+    from genassets.driving.log import Log
     from genassets.driving.synthetic.actors import Actor
     from genassets.reconstruction.library import AssetLibrary
     from genassets.reconstruction.settings import ReconstructionSettings
@@ -42,10 +42,6 @@ CLASSES = ("Car",)
 """Whose actors change places: as many of a kind as there are, so that every asset has a true mesh."""
 
 SEED = 1
-LEAST_SIDE = 12
-"""Pixels of an asset's box, along its shorter side, from which its label is judged."""
-
-GOOD_IOU = 0.8
 
 
 @dataclass(frozen=True)
@@ -69,18 +65,6 @@ class Made:
         """Mean seconds without the first image, for which much is read that later ones keep."""
         rest = self.seconds[way][1:]
         return sum(rest) / max(len(rest), 1)
-
-
-@dataclass(frozen=True)
-class Labels:
-    """How well boxes fit what is seen: intersection over union of their bounds, one an unoccluded asset and image."""
-
-    ious: list[float]
-
-    @property
-    def text(self) -> str:
-        good = sum(iou >= GOOD_IOU for iou in self.ious)
-        return f"{good / len(self.ious):.3f} ({len(self.ious)})" if self.ious else "none"
 
 
 def run(say: Callable[[str], None]) -> Sequence[Row]:
@@ -151,18 +135,7 @@ def measure(
     small = make_images(log, library, swap, views, say)
     large = make_images(enlarged(log, LARGER), library, swap, large_views, say)
     scene = make_scene(spec, seed, lambda actors: recast(actors, swap.model_of))
-    labels, true_labels, truths = Labels([]), Labels([]), []
-    swapped = with_tracks(log, swap)
-    for (camera, frame), composed in zip(small.views, small.composed, strict=True):
-        picture, truth = camera_view(scene, camera, frame)
-        truths.append(truth)
-        labels.ious.extend(label_ious(swapped, camera, frame, composed.visible))
-        seen = {
-            edit.placed.track.actor_id: picture.instances == _instance(scene.actors, edit.removed)
-            for edit in swap.edits
-            if edit.placed is not None and edit.removed is not None
-        }
-        true_labels.ious.extend(label_ious(swapped, camera, frame, seen))
+    truths = [camera_view(scene, camera, frame)[1] for camera, frame in small.views]
     masks = [composed.changed for composed in small.composed]
     ways = {
         "composed": [composed.image for composed in small.composed],
@@ -179,8 +152,6 @@ def measure(
         row["PSNR where changed"] = _psnr(images, truths, masks)
         row["PSNR elsewhere"] = _psnr(images, truths, [~mask for mask in masks])
         row["share changed"] = round(float(sum(mask.mean() for mask in masks)) / len(masks), 3)
-        row["boxes of IoU >= 0.8 (n)"] = labels.text if name == "composed" else ""
-        row["with true masks"] = true_labels.text if name == "composed" else ""
         rows.append(row)
     return rows
 
@@ -195,7 +166,7 @@ def make_images(
 
     composer = Composer(log, SceneRenderer(library), swap.edits, ComposeSettings())
     whole = SceneRenderer(with_swapped(library, log.name, swap))
-    swapped = with_tracks(log, swap)
+    swapped = with_tracks(log, swap.edits)
     made = Made([], [], [], {"composed": [], "whole frame": []})
     for camera, frame in views:
         say(f"{camera}, frame {frame}, {_size(log, 1)}")
@@ -242,10 +213,11 @@ def recast(actors: Sequence[Actor], model_of: Mapping[str, str]) -> tuple[Actor,
     )
 
 
-def with_tracks(log: Log, swap: Swap) -> Log:
+def with_tracks(log: Log, edits: Sequence[Edit]) -> Log:
     """The log with the placed assets' tracks instead of the removed actors'."""
-    tracks = [track for track in log.tracks if track.actor_id not in swap.model_of]
-    tracks += [edit.placed.track for edit in swap.edits if edit.placed is not None]
+    gone = {edit.removed.actor_id for edit in edits if edit.removed is not None}
+    tracks = [track for track in log.tracks if track.actor_id not in gone]
+    tracks += [edit.placed.track for edit in edits if edit.placed is not None]
     return replace(log, tracks=tuple(tracks))
 
 
@@ -257,40 +229,6 @@ def with_swapped(library: AssetLibrary, log_name: str, swap: Swap) -> AssetLibra
         row = assets.index[edit.placed.row]
         assets.loc[row, ["log", "actor_id"]] = [log_name, edit.placed.track.actor_id]
     return replace(library, assets=assets)
-
-
-def label_ious(log: Log, camera: str, frame: int, visible: Mapping[str, NDArray[np.bool_]]) -> list[float]:
-    """IoU of the bounds of each visible mask with those of its box; of boxes whole in the image, large enough, and
-    not touched by a nearer one.
-    """
-    import numpy as np
-
-    from genassets.augmentation.shot import Shot
-    from genassets.curation.occlusion import occluded_fractions
-
-    shot = Shot(log, camera, frame)
-    boxes = [(track, shot.box(track)) for track in log.tracks]
-    seen = [(track, box) for track, box in boxes if box is not None]
-    hidden = occluded_fractions([box.hull for _, box in seen], [box.depth for _, box in seen])
-    found = []
-    for (track, box), share in zip(seen, hidden, strict=True):
-        x0, y0, x1, y1 = box.bounds
-        if track.actor_id not in visible or share or box.truncation or min(x1 - x0, y1 - y0) < LEAST_SIDE:
-            continue
-        rows, columns = np.nonzero(visible[track.actor_id])
-        if not len(rows):
-            found.append(0.0)
-            continue
-        own = (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1)
-        width = max(0.0, min(x1, own[2]) - max(x0, own[0]))
-        height = max(0.0, min(y1, own[3]) - max(y0, own[1]))
-        union = (x1 - x0) * (y1 - y0) + (own[2] - own[0]) * (own[3] - own[1]) - width * height
-        found.append(float(width * height / union))
-    return found
-
-
-def _instance(actors: Sequence[Actor], track: Track) -> int:
-    return next(actor.instance for actor in actors if actor.actor_id in track.uuids)
 
 
 def _size(log: Log, factor: int) -> str:
@@ -326,7 +264,6 @@ def _psnr(
 BENCHMARK = Benchmark(
     name="augmentation",
     summary="Cars of a synthetic log in each other's places: images composed into the log's own, and whole frames "
-    "rendered, beside the true picture. Processor seconds; PSNR in dB; share of the boxes of unoccluded assets whose "
-    "bounds have IoU of at least 0.8 with those of what is seen of them",
+    "rendered, beside the true picture. Processor seconds; PSNR in dB",
     run=run,
 )

@@ -25,6 +25,7 @@ def benchmarks() -> tuple[Benchmark, ...]:
     from genassets.bench import (
         adaptation_start,
         augmentation,
+        augmented_labels,
         frechet,
         learning,
         masks,
@@ -46,4 +47,5 @@ def benchmarks() -> tuple[Benchmark, ...]:
         training_memory.BENCHMARK,
         frechet.BENCHMARK,
         augmentation.BENCHMARK,
+        augmented_labels.BENCHMARK,
     )

@@ -73,4 +73,7 @@ def intersect_box(origins: ArrayLike, directions: ArrayLike, size: ArrayLike) ->
     between = np.abs(origins) <= half
     near = np.where(parallel, np.where(between, -np.inf, np.inf), np.minimum(first, second))
     far = np.where(parallel, np.where(between, np.inf, -np.inf), np.maximum(first, second))
-    return near.max(axis=1), far.min(axis=1)
+    # Column by column: numpy reduces over three columns far slower.
+    return np.maximum(np.maximum(near[:, 0], near[:, 1]), near[:, 2]), np.minimum(
+        np.minimum(far[:, 0], far[:, 1]), far[:, 2]
+    )

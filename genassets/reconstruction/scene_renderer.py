@@ -167,8 +167,32 @@ class SceneRenderer:
 
         Feature rays run one for each stride x stride pixels, as in training; alpha and depth are enlarged.
         """
+        context = self._context
+        maps = self._actor_maps(log_name, actor_id, intrinsics, box_from_camera, context)
+        feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
+        rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3)).clamp(0, 1)
+        shown, opacity, depth = (
+            self._inside(image, intrinsics, context)
+            for image in (rgb, self._enlarged(alpha), self._enlarged(distance))
+        )
+        depth = (depth / np.maximum(opacity, 1e-6)).astype(np.float32)
+        return ActorView(shown * opacity, opacity[..., 0], depth[..., 0])
+
+    @torch.no_grad()
+    def actor_opacity(
+        self, log_name: str, actor_id: str, intrinsics: Intrinsics, box_from_camera: ArrayLike
+    ) -> Float[NDArray[np.float32], "height width"]:
+        """The alpha of render_actor, without what only its colours need."""
+        context = 1  # what enlarging reads
+        maps = self._actor_maps(log_name, actor_id, intrinsics, box_from_camera, context)
+        return self._inside(self._enlarged(maps[:, -2:-1]), intrinsics, context)[..., 0]
+
+    def _actor_maps(
+        self, log_name: str, actor_id: str, intrinsics: Intrinsics, box_from_camera: ArrayLike, context: int
+    ) -> Float[Tensor, "1 channels height width"]:
+        """Features, opacity and distance of one actor in feature pixels, `context` more on every side."""
         actor = self.library.index_of(log_name, actor_id)
-        stride, context = self.library.model.stride, self._context
+        stride = self.library.model.stride
         width, height = -(-intrinsics.width // stride), -(-intrinsics.height // stride)
         pixels = pixel_centres(-context, -context, width + context, height + context) * stride
         directions = transform_directions(box_from_camera, pixel_directions(intrinsics, pixels))
@@ -183,21 +207,20 @@ class SceneRenderer:
             out = render_rays(rays, culled, fields, None, self._settings)
             parts.append(torch.cat((out.feature, out.opacity[:, None], out.distance[:, None]), dim=1))
         grid = (1, height + 2 * context, width + 2 * context, -1)
-        maps = torch.cat(parts).reshape(grid).permute(0, 3, 1, 2)
-        feature, alpha, distance = maps[:, :-2], maps[:, -2:-1], maps[:, -1:]
-        rgb = self.library.model.rgb(feature / alpha.clamp(min=1e-3)).clamp(0, 1)
-        alpha, distance = (
-            F.interpolate(m, rgb.shape[-2:], mode="bilinear", align_corners=False) for m in (alpha, distance)
-        )
-        margin = context * stride
+        return torch.cat(parts).reshape(grid).permute(0, 3, 1, 2)
 
-        def crop(image: Tensor) -> NDArray[np.float32]:
-            inside = image[0, :, margin : margin + intrinsics.height, margin : margin + intrinsics.width]
-            return inside.permute(1, 2, 0).numpy()
+    def _enlarged(self, maps: Float[Tensor, "1 channels rows columns"]) -> Tensor:
+        """Maps of feature pixels at the size of images."""
+        stride = self.library.model.stride
+        return F.interpolate(maps, scale_factor=stride, mode="bilinear", align_corners=False)
 
-        opacity = crop(alpha)
-        depth = (crop(distance) / np.maximum(opacity, 1e-6)).astype(np.float32)
-        return ActorView(crop(rgb) * opacity, opacity[..., 0], depth[..., 0])
+    def _inside(
+        self, image: Float[Tensor, "1 channels rows columns"], intrinsics: Intrinsics, context: int
+    ) -> Float[NDArray[np.float32], "height width channels"]:
+        """An image (H, W, channels) without `context` feature pixels around it."""
+        margin = context * self.library.model.stride
+        inside = image[0, :, margin : margin + intrinsics.height, margin : margin + intrinsics.width]
+        return inside.permute(1, 2, 0).numpy()
 
     @torch.no_grad()
     def actor_sdf(
