@@ -27,7 +27,7 @@ from genassets.evaluation.turned_images import Source
 from genassets.evaluation.viewpoint import viewpoint_of
 from genassets.geometry.transforms import make_pose
 from genassets.pipeline.run_record import RunRecord, StepRecord
-from genassets.prior.baselines import BASELINES, class_gaussian
+from genassets.prior.baselines import BASELINES, class_gaussian, other_actor
 from genassets.prior.conditions import TIMES, Conditions
 from genassets.prior.prior_file import load_prior
 from genassets.prior.sampling import draw_conditions
@@ -205,6 +205,10 @@ def test_baselines_are_what_their_names_say() -> None:
     bus = made["class_gaussian"].codes[400] - codes.mean[-1]
     assert float(bus.abs().max()) < 6 * float(codes.deviation[-1].max())
     torch.testing.assert_close(made["class_gaussian"].sizes[400], codes.sizes[-1])
+    night = other_actor(codes, Conditions.of(["Car"] * 50, ["night"] * 50), 3)
+    found = (night.codes[:, None] == codes.mean[None]).flatten(2).all(dim=2).int().argmax(dim=1)
+    torch.testing.assert_close(night.sizes, codes.sizes[found])
+    assert set(found.tolist()) == {6, 7, 8}  # the night's cars
     again = class_gaussian(codes, conditions[:3], 3)
     torch.testing.assert_close(again.codes, made["class_gaussian"].codes[:3])
 
@@ -319,7 +323,7 @@ def test_the_evaluation_sets_the_prior_beside_floor_and_ceilings(
     objects = {**inputs.objects, "filter_occlusion": dict.fromkeys(log_names, tmp_path)}
     config = evaluate_generation.EvaluateGenerationConfig(images=12, least_images=8, steps=2, pictured=2)
     found = evaluate_generation.run(Inputs(objects), config, tmp_path, StageContext(0, None, tmp_path))
-    assert len(asked) == 5 * 12
+    assert len(asked) == (2 + len(BASELINES)) * 12
     rows = {(metric.metric, metric.method.partition(";")[0]) for metric in found}
     for name in ("library", "model", *BASELINES):
         assert {(metric, name) for metric in ("fid", "kid_x1000", "precision", "recall")} <= rows

@@ -17,6 +17,21 @@ Baseline = Callable[[LibraryCodes, Conditions, int], Samples]
 """Codes that were learned from, what samples are to be, and a seed to samples; each is drawn from its own number."""
 
 
+def other_actor(codes: LibraryCodes, conditions: Conditions, seed: int) -> Samples:
+    """An actor of the library of the class and, where there is one, the time of day: what is shown by who knows the
+    library by heart.
+    """
+    rows = []
+    for number, (actor_class, time) in enumerate(
+        zip(conditions.actor_class.tolist(), conditions.time.tolist(), strict=True)
+    ):
+        own = _of_class(codes, actor_class)
+        then = own[codes.conditions.time[own] == time]
+        own = then if len(then) else own
+        rows.append(int(own[int(np.random.default_rng([seed, number, 3]).integers(len(own)))]))
+    return Samples(codes.mean[rows], codes.sizes[rows], conditions)
+
+
 def mean_code(codes: LibraryCodes, conditions: Conditions, seed: int) -> Samples:
     """The mean of all codes, every time; sizes as of a random actor of the class."""
     mean = codes.mean.mean(dim=0).expand(len(conditions), *codes.mean.shape[1:])
@@ -49,6 +64,7 @@ def class_gaussian(codes: LibraryCodes, conditions: Conditions, seed: int) -> Sa
 
 
 BASELINES: Mapping[str, Baseline] = {
+    "other_actor": other_actor,
     "mean_code": mean_code,
     "gaussian": standard_gaussian,
     "class_gaussian": class_gaussian,

@@ -43,7 +43,8 @@ NAMES = {
 }
 GROUP_ORDER = ("moved", "same", "all", "no_crop", "360", "seen", "unseen")
 PREDICTOR_ORDER = (
-    "real_crops", "library", "model", "nearest_crop", "mean_colour", "class_gaussian", "mean_code", "gaussian"
+    "real_crops", "library", "model", "nearest_crop", "mean_colour",
+    "other_actor", "class_gaussian", "mean_code", "gaussian",
 )  # fmt: skip
 
 

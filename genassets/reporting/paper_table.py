@@ -17,11 +17,12 @@ BASELINES = {
     "nearest_crop": "nearest crop",
     "mean_colour": "mean colour",
     "library": "reconstructed (floor)",
+    "other_actor": "another reconstructed actor",
     "class_gaussian": "normal codes a class",
     "mean_code": "mean code",
     "gaussian": "N(0, 1) codes",
 }
-NO_CONTENDERS = ("library",)
+NO_CONTENDERS = ("library", "other_actor")
 """Lines that no best is looked for among: the actors that were reconstructed, not generated."""
 
 

@@ -9,7 +9,15 @@ from dataclasses import dataclass
 
 from genassets.reporting.metric_tables import GROUP_ORDER, MetricRow, better
 
-BASELINES = ("nearest_crop", "mean_colour", "class_gaussian", "mean_code", "gaussian", "real_crops")
+BASELINES = (
+    "nearest_crop",
+    "mean_colour",
+    "other_actor",
+    "class_gaussian",
+    "mean_code",
+    "gaussian",
+    "real_crops",
+)
 """Predictors that stand beside the product; what they reach says nothing of a setting of the product."""
 
 
