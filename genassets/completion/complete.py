@@ -18,7 +18,12 @@ from genassets.driving import Log
 from genassets.prior.conditions import Conditions
 from genassets.prior.generated_library import library_of_codes
 from genassets.prior.guidance import Say, guided_sample, no_word
-from genassets.prior.guidance_settings import GuidanceSettings, RefinementSettings, RenderingLossSettings
+from genassets.prior.guidance_settings import (
+    FEW_STEPS,
+    GuidanceSettings,
+    RefinementSettings,
+    RenderingLossSettings,
+)
 from genassets.prior.model import AssetPrior
 from genassets.prior.observed import Observed
 from genassets.prior.pull import DiffusionPull
@@ -35,7 +40,7 @@ class CompletionSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    sampling: SamplingSettings = SamplingSettings()
+    sampling: SamplingSettings = FEW_STEPS
     loss: RenderingLossSettings = RenderingLossSettings()
     guidance: GuidanceSettings = GuidanceSettings()
     refinement: RefinementSettings = RefinementSettings()

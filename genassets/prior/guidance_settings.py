@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from genassets.prior.settings import SamplingSettings
+
 PositiveInt = Annotated[int, Field(gt=0)]
 PositiveFloat = Annotated[float, Field(gt=0)]
 Weight = Annotated[float, Field(ge=0)]
@@ -15,6 +17,12 @@ Variant = Literal["plain", "denoiser", "clean"]
 
 class _Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+FEW_STEPS = SamplingSettings(steps=2)
+"""For completion: what many steps make up of sides that nobody saw is further from the truth than what is expected
+there, and refinement then has more of the seconds.
+"""
 
 
 class RenderingLossSettings(_Settings):
@@ -70,7 +78,7 @@ class GuidanceSettings(_Settings):
 class RefinementSettings(_Settings):
     """Adam's steps on codes alone, after sampling or instead of it: L_rend + pull L_diff."""
 
-    steps: Annotated[int, Field(ge=0)] = Field(default=0, description="steps; 0: none")
+    steps: Annotated[int, Field(ge=0)] = Field(default=40, description="steps; 0: none")
     rate: PositiveFloat = Field(default=0.02, description="Adam's rate, in deviations of the library's codes")
     pull: Weight = Field(default=0.0, description="weight of the prior's loss; 0 leaves it out")
     reuse: PositiveInt = Field(default=4, description="steps that a gradient of the prior is used for")

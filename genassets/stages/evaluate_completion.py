@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from genassets.prior.guidance_settings import (
+    FEW_STEPS,
     GuidanceSettings,
     RefinementSettings,
     RenderingLossSettings,
@@ -49,7 +50,7 @@ class EvaluateCompletionConfig(BaseModel):
         default=4, description="actors of a log that variants of guidance are compared on; 0: none"
     )
     swept_steps: tuple[PositiveInt, ...] = Field(
-        default=(5, 10, 25, 50), description="steps of the solver that they are compared with"
+        default=(2, 5, 10, 25), description="steps of the solver that they are compared with"
     )
     swept_variants: tuple[Variant, ...] = Field(
         default=("plain", "denoiser", "clean"), description="variants of guidance that are compared"
@@ -60,7 +61,7 @@ class EvaluateCompletionConfig(BaseModel):
     sdf_resolution: int = Field(
         default=48, ge=16, le=512, description="Grid points a side for the surface mesh."
     )
-    sampling: SamplingSettings = SamplingSettings()
+    sampling: SamplingSettings = FEW_STEPS
     loss: RenderingLossSettings = RenderingLossSettings()
     guidance: GuidanceSettings = GuidanceSettings()
     refinement: RefinementSettings = RefinementSettings()
