@@ -6,6 +6,7 @@ Prefect reads its settings from the environment when it is imported, so they are
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from genassets.pipeline.home import Home
 from genassets.pipeline.preflight import check_needs
 from genassets.pipeline.run_record import RUN_FILE, RunRecord, new_run_directory
 from genassets.tracking.address import shown_address
+
+_watcher: subprocess.Popen[bytes] | None = None
+"""Kept, for its pipe closes with it."""
 
 
 def prepare_environment(home: Home) -> None:
@@ -61,10 +65,13 @@ def run_flow(request: RunRequest) -> RunRecord:
         flush=True,
     )
     import httpx
+    from prefect.settings import PREFECT_API_URL
 
     from flows.experiment import experiment
 
     try:
+        if not PREFECT_API_URL.value():
+            _start_server()
         experiment(
             spec=request.spec,
             overrides=list(request.overrides),
@@ -89,6 +96,28 @@ def run_flow(request: RunRequest) -> RunRecord:
             f"{workflow.home.prefect / 'prefect.log'}; the same stages run without it with --engine inline"
         ) from error
     return record
+
+
+def _start_server() -> None:
+    """Start the server that Prefect starts where none is named, and have it end with this process, however that ends.
+
+    Prefect stops it on a clean exit alone. A shell waits for the end of a pipe that only this process writes to, and
+    the system closes that after SIGKILL too.
+    """
+    from prefect.server.api.server import SubprocessASGIServer
+    from prefect.settings import PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS
+
+    server = SubprocessASGIServer()
+    server.start(timeout=PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS.value())
+    assert server.server_process is not None
+    global _watcher
+    _watcher = subprocess.Popen(
+        ["/bin/sh", "-c", 'read _; kill "$0"', str(server.server_process.pid)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
 
 
 def _record_without_server(directory: Path, error: Exception) -> RunRecord:

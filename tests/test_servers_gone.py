@@ -11,6 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from genassets.pipeline.executor import run_metrics
@@ -190,3 +191,29 @@ def test_a_locked_prefect_database_ends_with_6(tmp_path: Path) -> None:
     assert "Prefect could not run the flow" in done.stderr and "--engine inline" in done.stderr
     done = toy_run(tmp_path, environment, "--no-mlflow", "--engine", "inline")
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_killed_run_takes_prefects_server_along(tmp_path: Path) -> None:
+    spec = tmp_path / "toy.yaml"
+    spec.write_text(SPEC)
+    with subprocess.Popen(
+        [sys.executable, "-m", "tests.toy_command", "run", str(spec), "--engine", "prefect"],
+        cwd=REPOSITORY,
+        env=toy_environment(tmp_path),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        own = psutil.Process(run.pid)
+        servers: list[psutil.Process] = []
+        for _ in range(600):
+            children = own.children(recursive=True)
+            servers = [child for child in children if "uvicorn" in " ".join(child.cmdline())]
+            if servers and any(child.name() == "sh" for child in children):
+                break
+            time.sleep(0.1)
+        assert servers
+        run.kill()
+        run.wait()
+    _, alive = psutil.wait_procs(servers, timeout=20)
+    assert not alive
