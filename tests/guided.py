@@ -16,7 +16,7 @@ from genassets.curation.observations import actor_returns, observe
 from genassets.driving import Log
 from genassets.masks.run_length import encode_mask
 from genassets.prior.guidance_settings import RenderingLossSettings
-from genassets.reconstruction.library import AssetLibrary
+from genassets.reconstruction.library import COLUMNS, AssetLibrary
 from genassets.reconstruction.scene import SceneFrame
 from genassets.reconstruction.settings import ReconstructionSettings
 from genassets.reconstruction.training import build_model
@@ -48,16 +48,7 @@ def library_beside(settings: ReconstructionSettings = SETTINGS) -> AssetLibrary:
     """An untrained library of another log, of chosen codes."""
     assets = pd.DataFrame(
         [("other", f"car-{n}", "Car", 4.4 + 0.1 * n, 1.9, 1.6, 3, "day") for n in range(4)],
-        columns=[
-            "log",
-            "actor_id",
-            "actor_class",
-            "size_l",
-            "size_w",
-            "size_h",
-            "observations",
-            "time_of_day",
-        ],
+        columns=[*COLUMNS, "time_of_day"],
     )
     model = build_model(assets, ["other"], settings, seed=0)
     with torch.no_grad():

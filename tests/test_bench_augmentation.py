@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_car_city import TINY_CAR_CITY
 from tiny_reconstruction import SETTINGS, Prepared, changed
 
 from genassets.bench import augmentation
@@ -59,21 +60,10 @@ def test_the_city_is_recast(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_benchmark_at_a_tiny_size(tmp_path: Path) -> None:
-    spec = CitySpec(
-        frames=2,
-        image_width=160,
-        image_height=90,
-        vehicles=12,
-        pedestrians=0,
-        classes=("Car",),
-        spinning_columns=180,
-        forward_columns=60,
-        supersampling=1,
-    )
-    root = synthesize_log(spec, 2, "swapped", tmp_path)
+    root = synthesize_log(TINY_CAR_CITY, 2, "swapped", tmp_path)
     library = augmentation.learn(root, changed(SETTINGS, steps=2), tmp_path / "work", lambda _: None)
     views = [(camera, frame) for camera in ("front_camera", "back_camera") for frame in (0, 1)]
-    rows = augmentation.measure(root, spec, 2, library, views, views[:2], lambda _: None)
+    rows = augmentation.measure(root, TINY_CAR_CITY, 2, library, views, views[:2], lambda _: None)
     assert [row["image"] for row in rows] == ["composed", "whole frame", "the log's own"]
     assert len({tuple(row) for row in rows}) == 1
     composed, whole, own = rows

@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from tiny_car_city import TINY_CAR_CITY
 from tiny_reconstruction import SETTINGS, changed
 
 from genassets.augmentation.edits import Edit, PlacedAsset
@@ -18,7 +19,6 @@ from genassets.bench import augmentation, augmented_labels
 from genassets.bench.augmented_labels import Swapped, intersections
 from genassets.bench.enlarged import enlarged
 from genassets.bench.label_fit import box_fits, iou
-from genassets.city_spec import CitySpec
 from genassets.driving import Log
 from genassets.driving.synthetic.synthesize import synthesize_log
 from genassets.driving.synthetic.truth import Truth
@@ -83,22 +83,11 @@ def test_only_boxes_that_share_space_intersect(log: Log) -> None:
 
 @pytest.mark.slow
 def test_the_benchmark_at_a_tiny_size(tmp_path: Path) -> None:
-    spec = CitySpec(
-        frames=2,
-        image_width=160,
-        image_height=90,
-        vehicles=12,
-        pedestrians=0,
-        classes=("Car",),
-        spinning_columns=180,
-        forward_columns=60,
-        supersampling=1,
-    )
     source, other = (
-        synthesize_log(spec, seed, name, tmp_path) for seed, name in ((2, "learned"), (3, "swapped"))
+        synthesize_log(TINY_CAR_CITY, seed, name, tmp_path) for seed, name in ((2, "learned"), (3, "swapped"))
     )
     library = augmentation.learn(source, changed(SETTINGS, steps=2), tmp_path / "work", lambda _: None)
-    rows = augmented_labels.measure(source, library, {3: other}, spec, lambda _: None)
+    rows = augmented_labels.measure(source, library, {3: other}, TINY_CAR_CITY, lambda _: None)
     assert len(rows) == 4 and len({tuple(row) for row in rows}) == 1
     assert rows[0]["boxes that meet"] == 0 and float(rows[0]["boxes in 3D"]) > 4
     assert float(rows[0]["largest gap, cm"]) < 5

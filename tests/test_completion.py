@@ -266,7 +266,7 @@ def test_a_prior_pulls_while_codes_are_adapted(prior: AssetPrior, tmp_path: Path
     with pytest.raises(ValidationError, match="adapt.prior pulls in one process alone"):
         reconstruct.ReconstructConfig(adapt=settings, processes=2, views=2)
     save_prior(prior, decoder_digest(library.model), tmp_path)
-    pull = prior_pull(settings, tmp_path, {"other": "night"}, library.model, library.assets)
+    pull = prior_pull(settings, tmp_path, library.model, library.assets.assign(time_of_day="night"))
     assert (pull.weight, pull.reuse) == (0.5, 3)
     codes = library.model.latents(torch.arange(4)).mean.detach()
     gradient = pull.gradients(torch.arange(4), codes, torch.Generator().manual_seed(0))
@@ -274,7 +274,7 @@ def test_a_prior_pulls_while_codes_are_adapted(prior: AssetPrior, tmp_path: Path
     with torch.no_grad():
         library.model.class_embedding += 1  # type: ignore[operator]
     with pytest.raises(StageError, match="codes of another decoder"):
-        prior_pull(settings, tmp_path, {"other": "night"}, library.model, library.assets)
+        prior_pull(settings, tmp_path, library.model, library.assets.assign(time_of_day="night"))
 
 
 def test_the_evaluation_needs_a_library_and_truth(log: Log, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from tiny_reconstruction import SETTINGS
 from genassets.prior.library_codes import LibraryCodes, library_codes
 from genassets.prior.settings import NetworkSettings, PriorSettings
 from genassets.prior.training import PriorTrainer, train_prior
-from genassets.reconstruction.library import AssetLibrary
+from genassets.reconstruction.library import COLUMNS, AssetLibrary
 from genassets.reconstruction.scene import SceneFrame
 from genassets.reconstruction.training import build_model
 from genassets.rendering.sampling import OccupancyGrid
@@ -47,16 +47,7 @@ def make_library(actors: Sequence[tuple[str, str, tuple[float, float, float]]] =
             (log, f"{name[:3].lower()}-{number:04d}", name, *size, 5, TIMES[log])
             for number, (log, name, size) in enumerate(actors)
         ],
-        columns=[
-            "log",
-            "actor_id",
-            "actor_class",
-            "size_l",
-            "size_w",
-            "size_h",
-            "observations",
-            "time_of_day",
-        ],
+        columns=[*COLUMNS, "time_of_day"],
     )
     logs = list(TIMES)
     model = build_model(assets, logs, SETTINGS, seed=0)

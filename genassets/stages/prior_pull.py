@@ -5,7 +5,6 @@ In a module of its own (Stage.code_when), so that a change of the prior reruns n
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,19 +24,16 @@ if TYPE_CHECKING:
 def prior_pull(
     settings: AdaptationSettings,
     path: Path,
-    times: Mapping[str, str],
     model: AssetModel,
     assets: pd.DataFrame,
 ) -> LatentPull:
-    """The prior's pull at the codes of a model that is adapted; times: "day" or "night" of each log.
+    """The prior's pull at the codes of a model that is adapted, of the assets of a library's table.
 
     Raises:
         StageError: the prior was learned from codes of another decoder.
     """
     trained = load_prior(path)
     trained.check_decoder(decoder_digest(model), f"reconstruct.adapt.prior, {path}")
-    conditions = Conditions.of(
-        [str(name) for name in assets["actor_class"]], [times[str(log)] for log in assets["log"]]
-    )
+    conditions = Conditions.of(list(map(str, assets["actor_class"])), list(map(str, assets["time_of_day"])))
     pull = DiffusionPull(trained.model, model.sizes, conditions)
     return LatentPull(pull, settings.prior_weight, settings.prior_reuse)

@@ -76,8 +76,7 @@ def run(inputs: Inputs, config: ReconstructConfig, out: Path, context: StageCont
 
         if chosen_device(compute) != "cpu":
             raise StageError("reconstruct.adapt.prior pulls on the CPU alone; set reconstruct.device=cpu")
-        times = {log.name: log.time_of_day for log in logs}
-        pull_of = partial(prior_pull, adapt, inputs.borrowed["train_prior"], times)
+        pull_of = partial(prior_pull, adapt, inputs.borrowed["train_prior"])
     if compute.processes > 1:
         counts = run_together(job, context.progress, context.curve)
     else:
