@@ -24,6 +24,19 @@ ALL_CLASSES: tuple[ActorClass, ...] = get_args(ActorClass)
 """The paper's eight, in its order."""
 
 
+class VehicleSwap(BaseModel):
+    """Other vehicles on the paths of those that a log's seed draws; all else stays.
+
+    It is what augmentation makes of a log (docs/augmentation.md), drawn with true meshes.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    seed: Annotated[int, Field(ge=0)]
+    share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
+    """Part of the vehicles that are swapped, for any class as often as a log has it."""
+
+
 class CitySpec(BaseModel):
     """One log of the synthetic city. With a seed it determines every byte of the log."""
 
@@ -43,6 +56,7 @@ class CitySpec(BaseModel):
     moving_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.35
     """Part of the vehicles that drive; the rest is parked along the kerbs."""
     pedestrians: Annotated[int, Field(ge=0, le=60)] = 8
+    swapped: VehicleSwap | None = None
     classes: tuple[ActorClass, ...] = ALL_CLASSES
     """Classes that may appear; each vehicle class named here appears at least once if there is room."""
     supersampling: Annotated[int, Field(ge=1, le=4)] = 2

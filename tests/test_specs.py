@@ -90,7 +90,7 @@ def test_malformed_yaml(text: str, message: str) -> None:
 def test_missing_file_lists_what_is_there(tmp_path: Path) -> None:
     with pytest.raises(
         SpecError,
-        match=r"known by name: augmentation_gain, .*, demo, pandaset_002, pandaset_002_adapted",
+        match=r"known by name: augmentation_ceiling, .*, demo, pandaset_002, pandaset_002_adapted",
     ):
         load_experiment("demmo", configs(CATALOG))
     with pytest.raises(SpecError, match="no such file"):

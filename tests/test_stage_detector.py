@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from test_detection_set import augment, build
 
-from genassets.detection.arms import REAL, REAL_AND_SIMULATED, Arm, frames_of, scene_and_frame
+from genassets.detection.arms import REAL, REAL_AND_SIMULATED, Arm, arms_of, frames_of, scene_and_frame
 from genassets.detection.detection_set import write_detection_set
 from genassets.detection.detector_file import load_detector
 from genassets.detection.frames import DetectionFrames
@@ -51,6 +51,16 @@ def test_arms_see_the_same_places(written: Path) -> None:
     both = frames_of(Arm(REAL_AND_SIMULATED, 0.34, 0), frames)
     assert [scene_and_frame(info) for info in both.infos] == [("900", 1, False), ("900", 1, True)]
     assert len(frames_of(Arm(REAL_AND_SIMULATED, 1.0, 0), frames)) == 6
+
+
+def test_arms_that_are_wanted(written: Path) -> None:
+    frames = DetectionFrames.open(written / "set" / v0_file("train"), SMALL)
+    assert [arm.name for arm in arms_of(frames, [1.0], [0])] == [REAL, REAL_AND_SIMULATED]
+    assert arms_of(frames, [1.0], [3], [REAL_AND_SIMULATED]) == [Arm(REAL_AND_SIMULATED, 1.0, 3)]
+    recorded = DetectionFrames.open(written / "set" / v0_file("val"), SMALL)
+    assert [arm.name for arm in arms_of(recorded, [1.0], [0])] == [REAL]
+    with pytest.raises(StageError, match="none of the set's 3 frames is"):
+        arms_of(recorded, [1.0], [0], [REAL_AND_SIMULATED])
 
 
 def test_frames_are_as_the_info_file_says(written: Path) -> None:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from genassets.city_spec import ALL_CLASSES, CitySpec
-from genassets.driving import CLASSES, class_of, open_log
+from genassets.city_spec import ALL_CLASSES, CitySpec, VehicleSwap
+from genassets.driving import CLASSES, VEHICLE_CLASSES, class_of, open_log
 from genassets.driving.synthetic.actors import Actor
 from genassets.driving.synthetic.fleet import STYLES, Model, build_model, ego_model, in_box_frame
 from genassets.driving.synthetic.images import render
@@ -24,7 +26,7 @@ from genassets.driving.synthetic.tracing import Placed, Solid, TracedCity
 from genassets.driving.synthetic.trajectories import ego_drive, parked
 from genassets.driving.synthetic.truth import open_truth, ply_bytes, read_ply
 from genassets.errors import EnvironmentProblem, LogError
-from genassets.geometry.boxes import points_in_box
+from genassets.geometry.boxes import box_corners, points_in_box
 from genassets.geometry.cameras import Intrinsics, project_box
 from genassets.geometry.transforms import heading_of, invert_pose, make_pose, transform_points
 
@@ -217,6 +219,31 @@ def test_nobody_touches_anybody() -> None:
                 if i != j:
                     tall = np.array([size[0], size[1], 50.0]) * [0.9, 0.9, 1.0]
                     assert not points_in_box(transform_points(pose, grid), other, tall).any(), (i, j, time)
+
+
+def test_swapped_vehicles_take_the_paths_of_others_and_change_nothing_else() -> None:
+    spec = CitySpec(frames=2, vehicles=20, pedestrians=3)
+    swapped = spec.model_copy(update={"swapped": VehicleSwap(seed=5, share=0.5)})
+    scene, other = make_scene(spec, 3), make_scene(swapped, 3)
+    pairs = list(zip(scene.actors, other.actors, strict=True))
+    changed = [(before, after) for before, after in pairs if before.actor_id != after.actor_id]
+    vehicles = [before for before, _ in pairs if before.model.actor_class in VEHICLE_CLASSES]
+    assert 0.3 * len(vehicles) < len(changed) <= round(0.5 * len(vehicles))
+    for before, after in pairs:
+        assert after.instance == before.instance
+        assert all(np.array_equal(x, y) for x, y in zip(before.path.at(1.0), after.path.at(1.0), strict=True))
+    assert all(after.model.actor_class in VEHICLE_CLASSES for _, after in changed)
+    assert any(not np.array_equal(before.model.size, after.model.size) for before, after in changed)
+    for one, another in itertools.combinations(
+        [a for a in other.actors if a.model.actor_class != "Pedestrian"], 2
+    ):
+        corners = [
+            box_corners(make_pose(a.pose(0.5)[0], [*a.pose(0.5)[1][:2], 0.0]), a.model.size)[:, :2]
+            for a in (one, another)
+        ]
+        hulls = [cv2.convexHull(c.astype(np.float32)) for c in corners]
+        assert cv2.intersectConvexConvex(*hulls)[0] == 0, (one.instance, another.instance)
+    assert [a.actor_id for a in make_scene(swapped, 3).actors] == [a.actor_id for a in other.actors]
 
 
 def test_every_vehicle_class_is_there() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from genassets.detection.frames import DetectionFrames
+from genassets.errors import StageError
 
 REAL, REAL_AND_SIMULATED = "real", "real+sim"
 ARMS = (REAL, REAL_AND_SIMULATED)
@@ -50,10 +51,25 @@ def frames_of(arm: Arm, frames: DetectionFrames) -> DetectionFrames:
     return replace(frames, infos=[frames.infos[row] for row in chosen])
 
 
-def arms_of(frames: DetectionFrames, shares: Sequence[float], seeds: Sequence[int]) -> list[Arm]:
-    """Every training of a set: recorded frames alone, and with augmented ones where the set has any."""
+def arms_of(
+    frames: DetectionFrames,
+    shares: Sequence[float],
+    seeds: Sequence[int],
+    wanted: Sequence[str] | None = None,
+) -> list[Arm]:
+    """Every training of a set: recorded frames alone, and with augmented ones where the set has any, or those wanted.
+
+    Raises:
+        StageError: augmented frames are wanted of a set that has none.
+    """
     augmented = any(scene_and_frame(info)[2] for info in frames.infos)
-    names = ARMS if augmented else (REAL,)
+    if REAL_AND_SIMULATED in (wanted or ()) and not augmented:
+        raise StageError(
+            f"train_detector.arms: {REAL_AND_SIMULATED} wants augmented frames, and none of the set's "
+            f"{len(frames)} frames is; expected scenes named <log>-aug<number>. Name augment among the `stages`, or "
+            f"take {REAL_AND_SIMULATED} out of `arms`."
+        )
+    names = wanted or (ARMS if augmented else (REAL,))
     return [Arm(name, share, seed) for share in shares for seed in seeds for name in names]
 
 

@@ -20,9 +20,7 @@ class Detector(nn.Module):
     def __init__(self, settings: DetectorSettings) -> None:
         super().__init__()
         self.settings = settings
-        backbone = backbone_of(settings.backbone, settings.stride, settings.pretrained)
-        # Of channels last, a training step at laptop size takes an eighth less on a CPU.
-        self.backbone = backbone.to(memory_format=torch.channels_last)
+        self.backbone = backbone_of(settings.backbone, settings.stride, settings.pretrained)
         if settings.pretrained:
             freeze(self.backbone)
         channels = settings.channels
@@ -57,6 +55,8 @@ class Detector(nn.Module):
         pixels of these images (0 at the left and upper edge) from metres of the ego frame.
         """
         height, width = images.shape[-2:]
-        features = self.neck(self.backbone(images.contiguous(memory_format=torch.channels_last)))
+        # Of channels last, a training step at laptop size takes an eighth less on a CPU.
+        images = images.contiguous(memory_format=torch.channels_last)
+        features = self.neck(self.backbone(images))
         plane = self.encoder(features, image_from_ego, width, height)
         return self.decoder(plane)

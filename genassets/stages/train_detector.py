@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -30,12 +30,20 @@ class TrainDetectorConfig(BaseModel):
     shares: tuple[Annotated[float, Field(gt=0, le=1)], ...] = Field(
         (1.0,), min_length=1, description="Shares of the recorded frames, one training each."
     )
+    arms: tuple[Literal["real", "real+sim"], ...] | None = Field(
+        None,
+        min_length=1,
+        description="Recorded frames alone, or with augmented ones; by default all that the set has.",
+    )
 
 
 def run(inputs: Inputs, config: TrainDetectorConfig, out: Path, context: StageContext) -> list[Metric]:
     """Write detectors/<arm>-<share>-<seed>.safetensors.
 
     All arms take as many steps: those that `training` says, or its epochs of all recorded frames.
+
+    Raises:
+        StageError: `arms` names augmented frames, and the set has none.
     """
     import math
     import shutil
@@ -50,7 +58,7 @@ def run(inputs: Inputs, config: TrainDetectorConfig, out: Path, context: StageCo
     training = config.training
     recorded = len(frames_of(Arm(REAL, 1.0, 0), frames))
     steps = training.steps or math.ceil(training.epochs * recorded / training.batch)
-    arms = arms_of(frames, config.shares, config.seeds)
+    arms = arms_of(frames, config.shares, config.seeds, config.arms)
     own = {arm: frames_of(arm, frames) for arm in arms}
     folder = context.work_dir / DETECTORS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from genassets.city_spec import CitySpec
+from genassets.city_spec import CitySpec, VehicleSwap
+from genassets.driving.classes import VEHICLE_CLASSES
 from genassets.driving.synthetic.fleet import Model, draw_model
 from genassets.driving.synthetic.layout import (
     CROSS_HALF,
@@ -25,6 +26,8 @@ from genassets.driving.synthetic.trajectories import LEAD_IN, Path, braking, par
 Float = NDArray[np.float64]
 ATTEMPTS = 80
 """Places tried for one actor before it is left out."""
+SWAP_ATTEMPTS = 24
+"""Models tried in place of one."""
 MARGIN = 0.22
 """Air kept around every footprint, metres."""
 
@@ -109,8 +112,8 @@ def populate(
 ) -> tuple[Actor, ...]:
     """The actors of a log. Those for whom no free place is found are left out (crowded specs)."""
     duration = max(spec.frames - 1, 1) / spec.rate_hz
-    span = (-LEAD_IN, duration + LEAD_IN)
-    crowd = _Crowd(np.arange(span[0], span[1] + 0.2, 0.2))
+    span = _span(spec)
+    crowd = _Crowd(_times(spec))
     crowd.add(ego_path, ego_size)
     actors: list[Actor] = []
 
@@ -136,6 +139,41 @@ def populate(
         model = draw_model("Pedestrian", rng)
         place(model, lambda: _sidewalk_path(layout, span, rng))
     return tuple(actors)
+
+
+def swap_vehicles(
+    actors: Sequence[Actor], spec: CitySpec, swap: VehicleSwap, ego_path: Path, ego_size: Float
+) -> tuple[Actor, ...]:
+    """The actors of a log with other vehicles in place of a share of theirs, under other uuids.
+
+    Two-wheelers and pedestrians stay, and so do vehicles for which none of SWAP_ATTEMPTS others has room.
+    """
+    rng = np.random.default_rng(swap.seed)
+    vehicles = [place for place, actor in enumerate(actors) if actor.model.actor_class in VEHICLE_CLASSES]
+    classes = [name for name in _draw_classes(spec, rng) if name in VEHICLE_CLASSES]
+    swapped = list(actors)
+    for place in rng.permutation(vehicles)[: round(swap.share * len(vehicles))].tolist():
+        crowd = _Crowd(_times(spec))
+        crowd.add(ego_path, ego_size)
+        for other in swapped[:place] + swapped[place + 1 :]:
+            crowd.add(other.path, other.model.size)
+        actor = actors[place]
+        for _ in range(SWAP_ATTEMPTS):
+            model = draw_model(classes[int(rng.integers(len(classes)))], rng)
+            if crowd.is_free(actor.path, model.size):
+                swapped[place] = replace(actor, actor_id=make_uuid(rng), model=model)
+                break
+    return tuple(swapped)
+
+
+def _times(spec: CitySpec) -> Float:
+    """When nobody may touch anybody, log seconds."""
+    first, last = _span(spec)
+    return np.arange(first, last + 0.2, 0.2)
+
+
+def _span(spec: CitySpec) -> tuple[float, float]:
+    return -LEAD_IN, max(spec.frames - 1, 1) / spec.rate_hz + LEAD_IN
 
 
 def _draw_classes(spec: CitySpec, rng: np.random.Generator) -> list[str]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from genassets.city_spec import CitySpec
 from genassets.driving.pandaset_writer import PandasetWriter, WrittenCamera, WrittenCuboid
-from genassets.driving.synthetic.actors import Actor, make_uuid, populate
+from genassets.driving.synthetic.actors import Actor, make_uuid, populate, swap_vehicles
 from genassets.driving.synthetic.city import build_city
 from genassets.driving.synthetic.fleet import Model, ego_model
 from genassets.driving.synthetic.images import Picture, expose, render
@@ -122,7 +122,10 @@ def make_scene(
     ego, layout = ego_drive(spec)
     ego_car = ego_model()
     city = build_city(layout, city_rng)
-    actors = tuple(recast(populate(spec, layout, ego, ego_car.size, crowd_rng)))
+    actors = populate(spec, layout, ego, ego_car.size, crowd_rng)
+    if spec.swapped is not None:
+        actors = swap_vehicles(actors, spec, spec.swapped, ego, ego_car.size)
+    actors = tuple(recast(actors))
     light = draw_light(spec.time_of_day == "night", city.lamps, light_rng)
     dark = glow_table(light.night, moving=False)
     placed = [Placed(city.mesh, 0, dark)]
