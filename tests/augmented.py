@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +29,12 @@ def table(*rows: tuple[str, str, str, tuple[float, float, float]], **columns: Se
     )
 
 
-ASSETS = Assets.of(
+def assets_of(name: str, table: pd.DataFrame, times: Mapping[str, str]) -> Assets:
+    """A library of logs whose times of day are known, or not."""
+    return Assets.of(name, table.assign(time_of_day=[times.get(log, "") for log in table["log"]]))
+
+
+ASSETS = assets_of(
     "lib",
     table(("a", "car-1", "Car", CAR), ("a", "car-2", "Car", VAN), ("b", "bus-1", "Bus", BUS)),
     {"a": "day", "b": "night"},

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
 import pytest
-from augmented import ASSETS, BUS, CAR, VAN, Painter, box_bodies, table
+from augmented import ASSETS, BUS, CAR, VAN, Painter, assets_of, box_bodies, table
 from box_renderer import box_renderer
 from tiny_log import CONE, MOVING, MOVING_TWIN, PARKED, WALKER, build_tiny_log
 
@@ -279,7 +279,7 @@ def test_a_log_in_which_nothing_would_change_is_refused(source: Log, tmp_path: P
 
 
 def test_removed_turned_and_inserted_actors_are_told_apart(source: Log, tmp_path: Path) -> None:
-    own = Assets.of("own", table(("tiny", PARKED, "Car", CAR), ("a", "van", "Car", VAN)), {"a": "day"})
+    own = assets_of("own", table(("tiny", PARKED, "Car", CAR), ("a", "van", "Car", VAN)), {"a": "day"})
     made = augment(
         source, tmp_path / "out", assets=own, fraction=0.0, remove=(WALKER,),
         rotate=({"actor": PARKED, "degrees": 180.0},),

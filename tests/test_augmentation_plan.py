@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from augmented import ASSETS, BUS, CAR, OWN, VAN, box_bodies, table
+from augmented import ASSETS, BUS, CAR, OWN, VAN, assets_of, box_bodies, table
 from pydantic import ValidationError
 from tiny_log import CAR_SIZE, CONE, MOVING, PARKED, WALKER, build_tiny_log
 
@@ -24,7 +24,7 @@ from genassets.errors import GenAssetsError, SpecError, StageError
 from genassets.geometry.transforms import heading_of, yaw_pose
 
 BODIES = box_bodies()
-WITH_OWN = Assets.of(
+WITH_OWN = assets_of(
     "own", table(("tiny", PARKED, "Car", OWN), ("a", "bus-1", "Bus", BUS)), {"tiny": "day", "a": "day"}
 )
 
@@ -74,7 +74,7 @@ def test_every_class_has_a_label_that_readers_know(actor_class: str) -> None:
 
 
 def test_the_same_seed_gives_the_same_plan_and_another_variant_another(log: Log) -> None:
-    many = Assets.of("many", table(*[("a", f"car-{n}", "Car", CAR) for n in range(40)]), {"a": "day"})
+    many = assets_of("many", table(*[("a", f"car-{n}", "Car", CAR) for n in range(40)]), {"a": "day"})
     first, again = (plan(log, many, seed=3) for _ in range(2))
     assert [t.actor_id for t in placed(first)] == [t.actor_id for t in placed(again)]
     assert [e.edit.placed.row for e in first.edits if e.edit.placed] == [
@@ -102,13 +102,13 @@ def test_the_fraction_is_of_the_actors_that_a_camera_sees(log: Log) -> None:
 
 
 def test_policies_keep_and_change_classes(log: Log) -> None:
-    day = Assets.of("lib", table(("a", "car-1", "Car", CAR), ("a", "bus-1", "Bus", VAN)), {"a": "day"})
+    day = assets_of("lib", table(("a", "car-1", "Car", CAR), ("a", "bus-1", "Bus", VAN)), {"a": "day"})
     assert {t.actor_class for t in placed(plan(log, day))} == {"Car"}
     seen = {t.actor_class for s in range(12) for t in placed(plan(log, day, seed=s, policy="any_vehicle"))}
     assert seen == {"Car", "Bus"}
     mixed = [t.actor_class for s in range(24) for t in placed(plan(log, day, seed=s, policy="mix"))]
     assert 2 < mixed.count("Bus") < 22
-    walkers = Assets.of("w", table(("a", "p", "Pedestrian", (0.6, 0.6, 1.7))), {"a": "day"})
+    walkers = assets_of("w", table(("a", "p", "Pedestrian", (0.6, 0.6, 1.7))), {"a": "day"})
     swapped = placed(
         plan(log, walkers, policy="any_vehicle", classes=("Pedestrian",), cameras=("front_left_camera",))
     )
@@ -121,16 +121,16 @@ def test_an_asset_of_the_actor_itself_is_no_change(log: Log) -> None:
 
 
 def test_day_logs_take_day_assets(log: Log) -> None:
-    assets = Assets.of(
+    assets = assets_of(
         "lib", table(("a", "c", "Car", CAR), ("b", "d", "Car", VAN)), {"a": "night", "b": "day"}
     )
     assert {t.size[0] for s in range(8) for t in placed(plan(log, assets, seed=s))} == {VAN[0]}
     both = {t.size[0] for s in range(8) for t in placed(plan(log, assets, seed=s, time_of_day="any"))}
     assert both == {CAR[0], VAN[0]}
-    generated = Assets.of("gen", table(("generated", "c", "Car", CAR), time_of_day=["night"]), {})
+    generated = Assets.of("gen", table(("generated", "c", "Car", CAR), time_of_day=["night"]))
     with pytest.raises(StageError, match="no Car of a day log, only of night.*time_of_day=any"):
         plan(log, generated)
-    unknown = Assets.of("lib", table(("a", "c", "Car", CAR)), {})
+    unknown = Assets.of("lib", table(("a", "c", "Car", CAR)))
     with pytest.raises(StageError, match="only of unknown"):
         plan(log, unknown)
 
@@ -144,7 +144,7 @@ def test_a_library_without_the_class_is_named(log: Log) -> None:
         StageError, match="lib: the library has no Truck, its 3 assets are Bus, Car.*`classes`"
     ):
         plan(log, classes=("Car", "Truck"))
-    walkers = Assets.of("walkers", table(("a", "p", "Pedestrian", (0.6, 0.6, 1.7))), {"a": "day"})
+    walkers = assets_of("walkers", table(("a", "p", "Pedestrian", (0.6, 0.6, 1.7))), {"a": "day"})
     with pytest.raises(StageError, match="walkers: the library has no Car"):
         plan(log, walkers, policy="any_vehicle", classes=("Car",))
     assert plan(log, walkers).eligible == 0, "by default only what the library can replace is asked for"
@@ -189,11 +189,11 @@ def test_boxes_are_checked_at_every_frame_and_against_all_that_stands_there(log:
 
 def test_an_asset_larger_than_the_lane_gives_way_to_one_that_fits(log: Log) -> None:
     wide = ("a", "wide", "Car", (5.0, 13.0, 3.0))  # from one side of the street to the other
-    assets = Assets.of("lib", table(wide, ("a", "fits", "Car", CAR)), {"a": "day"})
+    assets = assets_of("lib", table(wide, ("a", "fits", "Car", CAR)), {"a": "day"})
     made = [plan(log, assets, seed=s) for s in range(8)]
     assert {t.size[1] for p in made for t in placed(p)} == {CAR[1]}
     assert sum(p.retried for p in made) > 0
-    alone = plan(log, Assets.of("lib", table(wide), {"a": "day"}))
+    alone = plan(log, assets_of("lib", table(wide), {"a": "day"}))
     assert alone.edits == () and alone.left_alone == {"no asset fits": 2}
 
 
@@ -255,7 +255,7 @@ def test_scenario_edits_that_cannot_be_say_why(log: Log, values: dict[str, Any],
 
 def test_a_turn_into_another_box_is_refused(tmp_path: Path) -> None:
     log = open_log(build_tiny_log(tmp_path / "tiny", frames=3))
-    long = Assets.of("own", table(("tiny", PARKED, "Car", (14.0, 1.9, 1.6))), {"tiny": "day"})
+    long = assets_of("own", table(("tiny", PARKED, "Car", (14.0, 1.9, 1.6))), {"tiny": "day"})
     with pytest.raises(SpecError, match="turned by 90 degrees.*meets another box"):
         plan(log, long, fraction=0.0, rotate=({"actor": PARKED, "degrees": 90.0},))
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tiny_car_city import TINY_CAR_CITY
 from tiny_reconstruction import SETTINGS, changed
 
-from genassets.augmentation.edits import Edit, PlacedAsset
+from genassets.augmentation.edits import Edit, PlacedAsset, with_tracks
 from genassets.augmentation.shot import Shot
 from genassets.bench import augmentation, augmented_labels
 from genassets.bench.augmented_labels import Swapped, intersections
@@ -69,7 +69,7 @@ def test_only_boxes_that_share_space_intersect(log: Log) -> None:
 
     def meeting(*placed: PlacedAsset) -> set[tuple[str, str]]:
         edits = tuple(Edit(None, asset) for asset in placed)
-        both = augmentation.with_tracks(replace(log, tracks=()), edits)
+        both = with_tracks(replace(log, tracks=()), edits)
         swapped = Swapped(log, cast(Truth, SimpleNamespace()), edits, both)
         return {(one, other) for _, one, other in intersections(swapped)}
 

@@ -242,7 +242,7 @@ def test_swapped_vehicles_take_the_paths_of_others_and_change_nothing_else() -> 
             for a in (one, another)
         ]
         hulls = [cv2.convexHull(c.astype(np.float32)) for c in corners]
-        assert cv2.intersectConvexConvex(*hulls)[0] == 0, (one.instance, another.instance)
+        assert cv2.intersectConvexConvex(hulls[0], hulls[1])[0] == 0, (one.instance, another.instance)
     assert [a.actor_id for a in make_scene(swapped, 3).actors] == [a.actor_id for a in other.actors]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,12 +23,9 @@ class Assets:
     times: tuple[str, ...]
 
     @classmethod
-    def of(cls, name: str, table: pd.DataFrame, times_of_logs: Mapping[str, str]) -> Assets:
-        """The assets of a library; those of earlier versions don't know their time of day, but that of their log."""
-        if "time_of_day" in table:
-            times = [str(time) for time in table["time_of_day"]]
-        else:
-            times = [times_of_logs.get(str(log), "") for log in table["log"]]
+    def of(cls, name: str, table: pd.DataFrame) -> Assets:
+        """The assets of a library's table; one of an earlier version doesn't know its times of day."""
+        times = map(str, table["time_of_day"]) if "time_of_day" in table else [""] * len(table)
         return cls(name, table.reset_index(drop=True), tuple(times))
 
     def identity(self, row: int) -> tuple[str, str]:

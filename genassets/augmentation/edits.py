@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from genassets.driving.log import Track
+from genassets.driving.log import Log, Track
 
 
 @dataclass(frozen=True)
@@ -39,3 +40,11 @@ class Edit:
     def __post_init__(self) -> None:
         if self.removed is None and self.placed is None:
             raise ValueError("an edit has to remove an actor, place an asset, or both")
+
+
+def with_tracks(log: Log, edits: Sequence[Edit]) -> Log:
+    """The log with the placed assets' tracks instead of the removed actors'."""
+    gone = {edit.removed.actor_id for edit in edits if edit.removed is not None}
+    tracks = [track for track in log.tracks if track.actor_id not in gone]
+    tracks += [edit.placed.track for edit in edits if edit.placed is not None]
+    return replace(log, tracks=tuple(tracks))

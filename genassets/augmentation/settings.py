@@ -106,9 +106,10 @@ class AugmentSettings(_Settings):
     remove: tuple[str, ...] = Field(default=(), description="Annotation ids of actors that go.")
     rotate: tuple[Rotation, ...] = Field(default=(), description="Actors that are turned.")
     insert: tuple[Insertion, ...] = Field(default=(), description="Assets that are put somewhere.")
-    images: Literal["composed", "kept"] = Field(
+    images: Literal["composed", "rendered", "kept"] = Field(
         default="composed",
-        description="Actors are swapped in the images too; or images stay as recorded, for detectors on LiDAR alone.",
+        description="Assets are put into the recorded images; or whole frames rendered, by a library that has learned "
+        "the log; or images stay as recorded, for detectors on LiDAR alone.",
     )
     compose: ComposeSettings = ComposeSettings()
     lidar: LidarSettings = LidarSettings()

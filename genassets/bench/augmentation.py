@@ -162,11 +162,11 @@ def make_images(
     """The views in which something changes, composed and rendered."""
     from genassets.augmentation.compose import Composer
     from genassets.augmentation.compose_settings import ComposeSettings
+    from genassets.augmentation.rendered_frames import RenderedFrames
     from genassets.reconstruction.scene_renderer import SceneRenderer
 
     composer = Composer(log, SceneRenderer(library), swap.edits, ComposeSettings())
-    whole = SceneRenderer(with_swapped(library, log.name, swap))
-    swapped = with_tracks(log, swap.edits)
+    whole = RenderedFrames(log, SceneRenderer(library), swap.edits)
     made = Made([], [], [], {"composed": [], "whole frame": []})
     for camera, frame in views:
         say(f"{camera}, frame {frame}, {_size(log, 1)}")
@@ -176,11 +176,12 @@ def make_images(
             continue
         made.seconds["composed"].append(time.process_time() - start)
         start = time.process_time()
-        rendered = whole.render_image(swapped, camera, frame)
+        rendered = whole.compose(camera, frame)
         made.seconds["whole frame"].append(time.process_time() - start)
+        assert rendered is not None
         made.views.append((camera, frame))
         made.composed.append(composed)
-        made.rendered.append(_bytes(rendered, composed.image.shape))
+        made.rendered.append(rendered.image)
     return made
 
 
@@ -213,36 +214,9 @@ def recast(actors: Sequence[Actor], model_of: Mapping[str, str]) -> tuple[Actor,
     )
 
 
-def with_tracks(log: Log, edits: Sequence[Edit]) -> Log:
-    """The log with the placed assets' tracks instead of the removed actors'."""
-    gone = {edit.removed.actor_id for edit in edits if edit.removed is not None}
-    tracks = [track for track in log.tracks if track.actor_id not in gone]
-    tracks += [edit.placed.track for edit in edits if edit.placed is not None]
-    return replace(log, tracks=tuple(tracks))
-
-
-def with_swapped(library: AssetLibrary, log_name: str, swap: Swap) -> AssetLibrary:
-    """The library with the placed assets under their new ids, so that the scene renderer finds them in the log."""
-    assets = library.assets.copy()
-    for edit in swap.edits:
-        assert edit.placed is not None
-        row = assets.index[edit.placed.row]
-        assets.loc[row, ["log", "actor_id"]] = [log_name, edit.placed.track.actor_id]
-    return replace(library, assets=assets)
-
-
 def _size(log: Log, factor: int) -> str:
     camera = next(iter(log.cameras.values())).intrinsics
     return f"{factor * camera.width} x {factor * camera.height}"
-
-
-def _bytes(image: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """A render as bytes, at the size of the log's images."""
-    import cv2
-    import numpy as np
-
-    full = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_LINEAR)
-    return np.rint(255 * np.clip(full, 0, 1)).astype(np.uint8)
 
 
 def _psnr(

@@ -148,16 +148,16 @@ def measure(
 def swap(root: Path, renderer: SceneRenderer, bodies: Bodies) -> Swapped:
     """The vehicles that some camera sees swapped as the planner does it, for their class or any vehicle by a coin."""
     from genassets.augmentation.assets import Assets
+    from genassets.augmentation.edits import with_tracks
     from genassets.augmentation.plan import plan_variant
     from genassets.augmentation.settings import AugmentSettings
-    from genassets.bench.augmentation import with_tracks
     from genassets.driving import CAMERA_NAMES, open_log, steady_heights
     from genassets.driving.synthetic.truth import open_truth
 
     log, truth = steady_heights(open_log(root)), open_truth(root)
     assert truth is not None
     settings = AugmentSettings.model_validate({"policy": "mix", "fraction": 1.0, "cameras": CAMERA_NAMES})
-    assets = Assets.of("the library", renderer.assets, {})
+    assets = Assets.of("the library", renderer.assets)
     plan = plan_variant(log, assets, bodies, settings, LEARNED_SEED, 1)
     edits = tuple(planned.edit for planned in plan.edits)
     return Swapped(log, truth, edits, with_tracks(log, edits))

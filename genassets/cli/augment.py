@@ -55,9 +55,9 @@ def augment(
 
     wanted = augment_settings(policy, fraction, variants, settings or [])
     source = steady_heights(open_log(log))
-    directory, times = library_of(assets)
+    directory = library_of(assets)
     renderer = SceneRenderer.load(directory)
-    table = Assets.of(str(directory), renderer.assets, times)
+    table = Assets.of(str(directory), renderer.assets)
     bodies, digest = library_bodies(renderer, wanted.lidar.resolution), library_digest(directory)
     rows = []
     for number in range(1, wanted.variants + 1):
@@ -106,15 +106,12 @@ def augment_settings(
     return validate(AugmentSettings, document.values, document)
 
 
-def library_of(where: str) -> tuple[Path, dict[str, str]]:
-    """A library's directory, and "day" or "night" of its logs where a run tells."""
+def library_of(where: str) -> Path:
+    """A library's directory: one that is named, or that of a run or experiment."""
     from genassets.cli.run_outputs import outputs_of, run_of
     from genassets.pipeline.home import Home
-    from genassets.stages.ingested import times_of_day
 
     if (Path(where) / "config.json").is_file():
-        return Path(where), {}
+        return Path(where)
     record = run_of(Home.from_environment().runs, where, "reconstruct")
-    return outputs_of(record, "reconstruct", ADVICE)[""], times_of_day(
-        outputs_of(record, "ingest", ADVICE).values()
-    )
+    return outputs_of(record, "reconstruct", ADVICE)[""]

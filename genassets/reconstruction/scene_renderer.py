@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pandas as pd
@@ -64,7 +65,8 @@ class SceneRenderer:
 
     settings: how samples are placed and culled, by default as the library says. keep: what is done to an
     actor's decoded planes before they are kept. coarser: of a region's feature pixels only one in so many squared is
-    rendered, the others lie between. A library whose model is in float64 is rendered in it.
+    rendered, the others lie between. also: rows of actors that logs have and the table does not name, by actor id. A
+    library whose model is in float64 is rendered in it.
     """
 
     def __init__(
@@ -73,8 +75,9 @@ class SceneRenderer:
         settings: RenderSettings | None = None,
         keep: Callable[[Tensor], Tensor] = torch.Tensor.detach,
         coarser: int = 1,
+        also: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
-        self.library, self._coarser = library, coarser
+        self.library, self._coarser, self._also = library, coarser, also
         self._settings = settings or render_settings(library.settings.rendering)
         self._rays_at_once = min(RAYS_AT_ONCE, max(1, SAMPLES_AT_ONCE // self._settings.samples_of_a_ray))
         self._keep = keep
@@ -100,7 +103,7 @@ class SceneRenderer:
 
     def view(self, log: Log, camera: str, frame: int) -> View:
         """The view of a camera at a frame with the library's actors in it."""
-        index = self.library.indices_of_log(log.name)
+        index = {**self.library.indices_of_log(log.name), **self._also}
         scene = self.library.scenes[log.name]
         settings, stride = self.library.settings, self.library.model.stride
         return make_view(

@@ -87,13 +87,12 @@ def _variants(
     from genassets.augmentation.plan import plan_variant
     from genassets.curation.object_table import read_object_table
     from genassets.reconstruction.scene_renderer import SceneRenderer
-    from genassets.stages.ingested import times_of_day
 
     directory = _library(inputs, config)
     settings = AugmentSettings.model_validate(config.model_dump(include=set(AugmentSettings.model_fields)))
     renderer = SceneRenderer.load(directory)
     name = config.library or f"the {config.assets} library"
-    assets = Assets.of(name, renderer.assets, times_of_day(inputs.shards("ingest").values()))
+    assets = Assets.of(name, renderer.assets)
     bodies, digest = library_bodies(renderer, settings.lidar.resolution), library_digest(directory)
     masks = None
     if "prepare_masks" in inputs.objects:

@@ -73,16 +73,16 @@ def run(inputs: Inputs, config: EvaluateGenerationConfig, out: Path, context: St
     from genassets.prior.library_codes import library_codes
     from genassets.prior.prior_file import load_prior
     from genassets.reconstruction.scene_renderer import SceneRenderer
-    from genassets.stages.ingested import open_ingested, times_of_day
+    from genassets.stages.ingested import open_ingested
     from genassets.weights import path
 
     renderer = SceneRenderer.load(inputs.one("reconstruct"))
-    times = times_of_day(inputs.shards("ingest").values())
     codes = library_codes(renderer.library)
     trained = load_prior(inputs.one("train_prior"))
     trained.check_decoder(codes.decoder, str(inputs.one("train_prior")))
     shards = {shard: open_ingested(place) for shard, place in inputs.shards("ingest").items()}
     logs = {log.name: log for log in shards.values()}
+    times = {name: log.time_of_day for name, log in logs.items()}
     tables = inputs.shards("filter_occlusion")
     sources = [
         source for shard, log in shards.items() for source in _sources(tables[shard], log, renderer, config)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,22 +44,3 @@ def open_ingested(path: Path) -> Log:
     from genassets.driving import open_log, steady_heights
 
     return steady_heights(open_log(ingested_root(path)))
-
-
-def times_of_day(paths: Iterable[Path]) -> dict[str, str]:
-    """Time of day, "day" or "night", of each log that ingest objects stand for, by its name.
-
-    Raises:
-        StageError: content.json is missing or unreadable.
-    """
-    times = {}
-    for path in paths:
-        file = path / CONTENT_FILE
-        try:
-            content = json.loads(file.read_text(encoding="utf-8"))
-            times[str(content["name"])] = str(content["time_of_day"])
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise StageError(
-                f"{file}: not the output of the ingest stage ({error}); run: genassets verify"
-            ) from error
-    return times

@@ -31,7 +31,7 @@ class TrainDetectorConfig(BaseModel):
         (1.0,), min_length=1, description="Shares of the recorded frames, one training each."
     )
     arms: tuple[Literal["real", "real+sim"], ...] | None = Field(
-        None,
+        default=None,
         min_length=1,
         description="Recorded frames alone, or with augmented ones; by default all that the set has.",
     )
