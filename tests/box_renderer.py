@@ -34,7 +34,7 @@ class BoxRenderer:
         self.assets = pd.DataFrame({"log": "elsewhere", "actor_id": ids, "actor_class": "Car"})
         self.assets[["size_l", "size_w", "size_h"]] = sizes
         self.library = SimpleNamespace(indices_of_log=lambda log: learned or {}, scenes={})
-        self.pixels = 0
+        self.plane_size, self.pixels = 64, 0
 
     def render_actor(
         self, log_name: str, actor_id: str, intrinsics: Intrinsics, box_from_camera: ArrayLike

@@ -162,7 +162,7 @@ def test_a_box_around_a_part_of_an_asset_is_where_that_part_is(wide: Log) -> Non
 
 def test_a_large_asset_is_rendered_no_larger_than_allowed(wide: Log) -> None:
     renderer = box_renderer(CAR_SIZE)
-    settings = ComposeSettings(render_pixels=256)
+    settings = ComposeSettings(pixels_a_texel=0.25)  # of 64 texels a side: 16 x 16 pixels
     composer = Composer(wide, renderer, [Edit(None, standing(wide, 9.0, 0.0))], settings)
     assert sure(composer.compose(FRONT, 0)).visible[NEW].sum() > 1000
     assert renderer.pixels <= 280  # type: ignore[attr-defined]

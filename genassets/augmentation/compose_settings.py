@@ -17,9 +17,10 @@ class ComposeSettings(BaseModel):
     render_scale: Annotated[float, Field(gt=0, le=1)] = Field(
         default=1.0, description="size at which assets are rendered, as a share of the image's"
     )
-    render_pixels: Annotated[int, Field(ge=64)] = Field(
-        default=32_000,
-        description="pixels of an asset's box at most that are rendered; a larger one is rendered coarser and enlarged",
+    pixels_a_texel: Annotated[float, Field(gt=0)] = Field(
+        default=2.0,
+        description="pixels at most along each side of a texel of its planes, which hold no more, that an asset's box "
+        "is rendered at; a nearer one is rendered coarser and enlarged",
     )
     outline_margin: Metres = Field(
         default=0.12, description="by how much the removed actor's box is grown where there is no mask of it"

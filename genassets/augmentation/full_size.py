@@ -57,9 +57,8 @@ def render_layer(
     shrunk[:3, 3] = (lowest + highest) / 2
     box_from_camera = shrunk @ invert_pose(camera_from_box)
     window = shot.intrinsics.cropped(*region)
-    scale = min(
-        settings.render_scale, math.sqrt(settings.render_pixels / (window.width * window.height)), 1.0
-    )
+    finest = settings.pixels_a_texel * renderer.plane_size / math.sqrt(window.width * window.height)
+    scale = min(settings.render_scale, finest, 1.0)
     rendered = window.resized(max(1, round(window.width * scale)), max(1, round(window.height * scale)))
     view = renderer.render_actor(str(asset["log"]), str(asset["actor_id"]), rendered, box_from_camera)
     size = (window.width, window.height)

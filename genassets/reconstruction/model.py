@@ -69,8 +69,7 @@ class AssetModel(nn.Module):
         actors = len(sizes)
         shape = (settings.latent_channels, settings.latent_size, settings.latent_size)
         if not settings.decoder:
-            side = settings.latent_size * 2 ** (len(settings.decoder_channels) - 1)
-            shape = (3 * settings.plane_channels, side, side)
+            shape = (3 * settings.plane_channels, settings.plane_size, settings.plane_size)
         width = math.prod(shape)
         self.latent_shape = shape
         self.class_embedding = (

@@ -96,6 +96,11 @@ class SceneRenderer:
         """log, actor_id, actor_class, size_l, size_w, size_h (metres), observations of every actor."""
         return self.library.assets
 
+    @property
+    def plane_size(self) -> int:
+        """Texels along a side of an actor's planes."""
+        return self.library.settings.model.plane_size
+
     def render_intrinsics(self, log: Log, camera: str) -> Intrinsics:
         """The camera at the size at which its images are rendered and compared."""
         stored = log.cameras[camera].intrinsics

@@ -57,6 +57,11 @@ class ModelSettings(_Settings):
             )
         return self
 
+    @property
+    def plane_size(self) -> int:
+        """Texels along a side of an actor's planes: every block of the decoder but the first doubles the latent."""
+        return self.latent_size * 2 ** (len(self.decoder_channels) - 1)
+
 
 class RenderingSettings(_Settings):
     """Sampling along rays. Lengths in metres."""
