@@ -124,7 +124,7 @@ def measure(
     Seconds are of this process's processors, all threads together, so that a busy machine does not count. They leave
     out each way's first image, for which much is read that later ones keep. PSNR is to the true picture of the city
     with the same meshes in the same places, over the pixels that composing reports as changed and over all others,
-    pooled over all images.
+    pooled over all images; once more with every actor swapped for itself, where the log's own image is the truth.
     """
     from genassets.bench.enlarged import enlarged
     from genassets.driving import open_log, steady_heights
@@ -134,6 +134,9 @@ def measure(
     swap = change_places(log, library, CLASSES)
     small = make_images(log, library, swap, views, say)
     large = make_images(enlarged(log, LARGER), library, swap, large_views, say)
+    itself = make_images(log, library, change_places(log, library, CLASSES, by=0), views, say)
+    recorded = [log.cameras[camera].image(frame) for camera, frame in itself.views]
+    again = {"composed": [composed.image for composed in itself.composed], "whole frame": itself.rendered}
     scene = make_scene(spec, seed, lambda actors: recast(actors, swap.model_of))
     truths = [camera_view(scene, camera, frame)[1] for camera, frame in small.views]
     masks = [composed.changed for composed in small.composed]
@@ -151,6 +154,8 @@ def measure(
             row[f"times faster at {size}"] = round(times, 1) if name == "composed" else ""
         row["PSNR where changed"] = _psnr(images, truths, masks)
         row["PSNR elsewhere"] = _psnr(images, truths, [~mask for mask in masks])
+        same = [composed.changed for composed in itself.composed]
+        row["PSNR for itself"] = _psnr(again[name], recorded, same) if name in again else ""
         row["share changed"] = round(float(sum(mask.mean() for mask in masks)) / len(masks), 3)
         rows.append(row)
     return rows
@@ -185,9 +190,9 @@ def make_images(
     return made
 
 
-def change_places(log: Log, library: AssetLibrary, classes: Sequence[str]) -> Swap:
+def change_places(log: Log, library: AssetLibrary, classes: Sequence[str], by: int = 1) -> Swap:
     """Each actor of some classes that the library has learned is replaced by the next longer one, the longest by the
-    shortest.
+    shortest; or by the one that is so many places on in this order, itself if `by` is 0.
     """
     from genassets.augmentation.edits import Edit, PlacedAsset
 
@@ -196,7 +201,7 @@ def change_places(log: Log, library: AssetLibrary, classes: Sequence[str]) -> Sw
     chosen.sort(key=lambda track: (float(track.size[0]), track.actor_id))
     edits, model_of = [], {}
     for number, track in enumerate(chosen):
-        other = chosen[(number + 1) % len(chosen)]
+        other = chosen[(number + by) % len(chosen)]
         poses = track.world_from_box.copy()
         poses[:, 2, 3] += (other.size[2] - track.size[2]) / 2
         identity = f"{other.actor_id}-in-place-of-{track.actor_id}"
