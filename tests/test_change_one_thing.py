@@ -123,7 +123,7 @@ def other_values(value: Any, words: list[str], made: Made) -> list[Any]:
     if isinstance(value, list):
         edits = [[{"actor": "a", "degrees": 1.0}], [{"x": 1.0, "y": 1.0}]]
         return [value[:-1], [*value, *value[-1:]], [item * 2 for item in value], ["left_camera"], *edits]
-    return [*words, str(made.library.parent), 1, 0.5, str(made.library / "weights"), ["Car"]]
+    return [*words, str(made.library.parent), 1, 0.5, str(made.library / "weights"), ["Car"], ["real"]]
 
 
 def changed_section(made: Made, stage: str, at: At) -> dict[str, Any] | None:

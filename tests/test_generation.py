@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
@@ -38,6 +39,9 @@ from genassets.stages.stage import Inputs, Metric, StageContext
 
 BOX = (4.0, 2.0, 1.5)
 
+TIME_OF_LOG = {"noon": "day", "midnight": "night"}
+"""Of the logs of the run that stages read."""
+
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
@@ -45,12 +49,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
     root = tmp_path_factory.mktemp("run")
     library = make_library()
     save_library(library, root / "library")
-    shards = {}
-    for log, time in (("noon", "day"), ("midnight", "night")):
-        shards[log] = root / log
-        shards[log].mkdir()
-        content = {"name": log, "time_of_day": time}
-        (shards[log] / "content.json").write_text(json.dumps(content), encoding="utf-8")
+    shards = {log: root / log for log in TIME_OF_LOG}
     objects = {"ingest": shards, "reconstruct": {"": root / "library"}, "train_prior": {"": root / "prior"}}
     config = train_prior.TrainPriorConfig.model_validate(TINY.model_dump())
     for name in ("prior", "work"):
@@ -284,7 +283,7 @@ def test_the_evaluation_sets_the_prior_beside_floor_and_ceilings(
 
     class Ingested:
         def __init__(self, path: Path) -> None:
-            self.name = path.name
+            self.name, self.time_of_day = path.name, TIME_OF_LOG[path.name]
 
     sources = [
         replace(
@@ -338,7 +337,8 @@ def test_the_evaluation_sets_the_prior_beside_floor_and_ceilings(
 
 def test_too_few_crops_are_counted(inputs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "genassets.stages.ingested.open_ingested", lambda path: type("L", (), {"name": path.name})()
+        "genassets.stages.ingested.open_ingested",
+        lambda path: SimpleNamespace(name=path.name, time_of_day="day"),
     )
     monkeypatch.setattr(evaluate_generation, "_sources", lambda *_: [])
     objects = {**inputs.objects, "filter_occlusion": dict.fromkeys(("noon", "midnight"), tmp_path)}
