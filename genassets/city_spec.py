@@ -57,6 +57,7 @@ class CitySpec(BaseModel):
     """Part of the vehicles that drive; the rest is parked along the kerbs."""
     pedestrians: Annotated[int, Field(ge=0, le=60)] = 8
     swapped: VehicleSwap | None = None
+    """None leaves the vehicles that the seed draws."""
     classes: tuple[ActorClass, ...] = ALL_CLASSES
     """Classes that may appear; each vehicle class named here appears at least once if there is room."""
     supersampling: Annotated[int, Field(ge=1, le=4)] = 2

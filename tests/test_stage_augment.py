@@ -43,8 +43,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Inputs:
         objects["ingest"][name].mkdir(parents=True)
         log_file = {"name": name, "kind": "pandaset", "path": str(root / "logs" / name)}
         (objects["ingest"][name] / "log.json").write_text(json.dumps(log_file))
-        content = {"name": name, "time_of_day": "day"}
-        (objects["ingest"][name] / "content.json").write_text(json.dumps(content))
     save_library(
         make_library([("noon", "Car", (4.4, 1.9, 1.5)), ("noon", "Car", (4.0, 1.7, 1.4))]), root / "library"
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pandas as pd
 import pytest
@@ -130,6 +131,8 @@ def test_every_arm_is_trained_once_and_measured(written: Path, tmp_path: Path) -
                                                    f"detector/{REAL_AND_SIMULATED}/1"}  # fmt: skip
     listed = json.loads((measured / "pictures.json").read_text())
     assert [entry["file"] for entry in listed] == ["pictures/boxes.png", "pictures/precision_recall.png"]
+    drawn = cv2.imread(str(measured / "pictures/boxes.png"))
+    assert ((drawn > 60) & (drawn < 200)).any(), "points are grey, the brighter the higher, and not white all"
 
 
 def test_a_file_that_is_no_detector_is_refused(tmp_path: Path) -> None:

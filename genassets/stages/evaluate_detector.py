@@ -138,7 +138,7 @@ def _drawn(
         boxes = other_layout(np.concatenate([frame.boxes, sure]))
         colours = [(255, 255, 255)] * len(frame.boxes) + [(255, 150, 0)] * len(sure)
         points = np.fromfile(folder / infos[place]["lidar_path"], np.float32).reshape(-1, len(POINT_FEATURES))
-        panels.append(draw_from_above(points, boxes, colours, region))
+        panels.append(draw_from_above(points, boxes, colours, region) / np.float32(255))
     return side_by_side(panels)
 
 

@@ -173,13 +173,13 @@ def _row(card: Card) -> dict[str, Any]:
 def _source_logs(inputs: Inputs) -> dict[str, SourceLog]:
     """The logs of the run, by name."""
     from genassets.curation.object_table import read_object_table
-    from genassets.stages.ingested import LOG_FILE
+    from genassets.stages.ingested import CONTENT_FILE, LOG_FILE
 
     tables = inputs.shards("filter_occlusion")
     logs = {}
     for shard, path in inputs.shards("ingest").items():
         entry = json.loads((path / LOG_FILE).read_text(encoding="utf-8"))
-        content = json.loads((path / "content.json").read_text(encoding="utf-8"))
+        content = json.loads((path / CONTENT_FILE).read_text(encoding="utf-8"))
         table = read_object_table(tables[shard] / "objects.parquet")
         observed = {str(actor): _observed(rows) for actor, rows in table.groupby("actor_id")}
         logs[entry["name"]] = SourceLog(entry["kind"], content["time_of_day"], observed)
