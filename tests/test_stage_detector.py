@@ -132,6 +132,7 @@ def test_every_arm_is_trained_once_and_measured(written: Path, tmp_path: Path) -
     listed = json.loads((measured / "pictures.json").read_text())
     assert [entry["file"] for entry in listed] == ["pictures/boxes.png", "pictures/precision_recall.png"]
     drawn = cv2.imread(str(measured / "pictures/boxes.png"))
+    assert drawn is not None
     assert ((drawn > 60) & (drawn < 200)).any(), "points are grey, the brighter the higher, and not white all"
 
 
