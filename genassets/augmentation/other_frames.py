@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 
-from genassets.augmentation.shot import Shot
+from genassets.augmentation.shot import Shot, in_bounds
 from genassets.augmentation.static_depth import NEAREST, StaticPoints, in_sight
 from genassets.curation.occlusion import inside_convex
 from genassets.driving import Log
@@ -117,7 +117,7 @@ class OtherFrames:
         camera = other.intrinsics
         pixels = project(camera, in_camera)
         shown = (in_camera[:, 2] > NEAREST) & (in_camera[:, 2] < COARSER * depth)
-        shown &= np.all((pixels > 1) & (pixels < [camera.width - 1, camera.height - 1]), axis=1)
+        shown &= in_bounds(pixels, (1, 1, camera.width - 1, camera.height - 1))
         if shown.any():
             shown &= ~through_ego(other, points)
             for hull in self._hulls(other.camera, other.frame):

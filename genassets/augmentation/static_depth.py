@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from genassets.augmentation.shot import Region, Shot
+from genassets.augmentation.shot import Region, Shot, in_bounds
 from genassets.driving import Log
 from genassets.geometry.boxes import points_in_box
 from genassets.geometry.cameras import project
@@ -32,7 +32,7 @@ CELL = 24
 SLACK, SLACK_SHARE = 0.3, 0.06
 """Metres, and share of the distance, by which a point may lie behind the nearest one of its cell and still be seen."""
 
-POINTS_AT_MOST = 6000
+POINTS_AT_MOST = 3000
 """Points that are interpolated between: their triangles grow costly, and more tell nothing new."""
 
 VIEW_CELLS = 96
@@ -108,8 +108,8 @@ def points_in_view(
     ahead = np.flatnonzero(in_camera[:, 2] > NEAREST)
     in_camera = in_camera[ahead]
     pixels = project(camera, in_camera)
-    inside = (pixels[:, 0] > -camera.width / 2) & (pixels[:, 0] < 1.5 * camera.width)
-    inside &= (pixels[:, 1] > -camera.height / 2) & (pixels[:, 1] < 1.5 * camera.height)
+    half = (camera.width / 2, camera.height / 2)
+    inside = in_bounds(pixels, (-half[0], -half[1], camera.width + half[0], camera.height + half[1]))
     return PointsInView(in_camera[inside], pixels[inside], sweep[ahead[inside]])
 
 
@@ -126,8 +126,7 @@ def surface_points(
     nothing = np.full((len(pixels), 3), np.nan)
     x0, y0, x1, y1 = region
     wide = (2 * x0 - x1, 2 * y0 - y1, 2 * x1 - x0, 2 * y1 - y0)
-    near = (points.pixels[:, 0] > wide[0]) & (points.pixels[:, 0] < wide[2])
-    near &= (points.pixels[:, 1] > wide[1]) & (points.pixels[:, 1] < wide[3])
+    near = in_bounds(points.pixels, wide)
     places, depth = points.pixels[near], points.in_camera[near, 2]
     size = max(x1 - x0, y1 - y0) / CELL
     nearest = minimum_filter(_grid(places, depth, wide, size), (1, 3), mode="nearest")
@@ -159,8 +158,8 @@ def in_sight(
     nearest = _grid(around.pixels, around.in_camera[:, 2], whole, size)
     in_camera = transform_points(shot.camera_from_world, points)
     asked = project(camera, in_camera)
-    inside = (in_camera[:, 2] > NEAREST) & np.all(asked >= 1, axis=1)
-    inside &= (asked[:, 0] < camera.width - 1) & (asked[:, 1] < camera.height - 1)
+    inside = in_bounds(asked, (1, 1, camera.width - 1, camera.height - 1))
+    inside &= in_camera[:, 2] > NEAREST
     seen = np.zeros(len(points), dtype=bool)
     cell = (asked[inside] / size).astype(np.int64)
     limit = nearest[cell[:, 1], cell[:, 0]]
@@ -173,7 +172,7 @@ def _grid(places: Array, depth: Array, region: Region, size: float) -> Array:
     x0, y0, x1, y1 = region
     columns, rows = int(np.ceil((x1 - x0) / size)) + 1, int(np.ceil((y1 - y0) / size)) + 1
     cell = ((places - [x0, y0]) / size).astype(np.int64)
-    inside = np.all(cell >= 0, axis=1) & (cell[:, 0] < columns) & (cell[:, 1] < rows)
+    inside = in_bounds(cell, (0, 0, columns, rows))
     nearest = np.full((rows, columns), np.inf)
     np.minimum.at(nearest, (cell[inside, 1], cell[inside, 0]), depth[inside])
     return nearest

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
 from genassets.augmentation.outlines import dilated
-from genassets.augmentation.shot import Region, Shot
+from genassets.augmentation.shot import Region, Shot, in_bounds
 from genassets.augmentation.static_depth import StaticPoints
 from genassets.driving import Track
 from genassets.geometry.boxes import points_in_box
@@ -45,10 +45,11 @@ def static_occluders(
     if not finite.any():
         return hidden > 0
     points = static.before(shot)
-    places = points.pixels - np.array(region[:2])
     farthest = float(distance[finite].max())
-    inside = np.all((places >= 0) & (places < [width, height]), axis=1) & (points.in_camera[:, 2] < farthest)
-    in_camera, places, sweep = points.in_camera[inside], places[inside], points.sweep[inside]
+    inside = in_bounds(points.pixels, region)
+    inside &= points.in_camera[:, 2] < farthest
+    in_camera, sweep = points.in_camera[inside], points.sweep[inside]
+    places = points.pixels[inside] - np.array(region[:2])
     along = np.linalg.norm(in_camera, axis=1)
     ahead = along < distance[places[:, 1].astype(int), places[:, 0].astype(int)] - BEFORE
     in_camera, places, sweep, along = in_camera[ahead], places[ahead], sweep[ahead], along[ahead]
