@@ -14,6 +14,7 @@ from genassets.pipeline.run_record import METRICS_FILE, RunRecord, read_metrics
 from genassets.pipeline.store import CURVES
 from genassets.reporting.comparison_plots import Axis, Panel, RunMark, is_number, mark_of
 from genassets.reporting.metric_tables import ARROWS, better, format_value, measure_name
+from genassets.reporting.pages import fill_page
 from genassets.reporting.report import PAGE, STYLE, duration_text, making_seconds
 from genassets.reporting.shared_metrics import SharedMetric, main_metrics, side_by_side
 
@@ -79,21 +80,13 @@ def write_comparison(records: Sequence[RunRecord], partial: Path, directory: Pat
     Everything but the runs' own reports, to which it links, lies in the folder. Returns the page where it will be.
     Raises OSError or ValueError where metrics or curves cannot be read.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     found = compare(records)
     metrics = side_by_side([read_metrics(record.directory / METRICS_FILE) for record in records])
     settings = [row for row in found.settings if row.differs]
-    environment = Environment(
-        loader=PackageLoader("genassets.reporting", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     partial.mkdir(parents=True, exist_ok=True)
     curves, same = _curve_plots(records, partial)
-    page = environment.get_template(TEMPLATE).render(
+    page = fill_page(
+        TEMPLATE,
         runs=[_head(index, record, directory) for index, record in enumerate(records)],
         settings=_settings_table(settings),
         equal_settings=len(found.settings) - len(settings),

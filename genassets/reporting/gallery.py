@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from genassets.reporting.pages import fill_page
+
 GALLERY_PAGE = "index.html"
 TEMPLATE = "gallery.html.j2"
 OWN_FILES = ("report.css", "gallery.css", "gallery.js")
@@ -40,8 +42,6 @@ def write_gallery(export: Path, folder: Path, title: GalleryTitle) -> Path:
     Everything shown is copied into the folder, so it can be moved or sent. Raises ValueError for a card that is not
     JSON, OSError where files are missing.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     folder.mkdir(parents=True, exist_ok=True)
     if folder.resolve() != export.resolve():
         shutil.copytree(export / ACTORS, folder / ACTORS) if (export / ACTORS).is_dir() else None
@@ -50,15 +50,11 @@ def write_gallery(export: Path, folder: Path, title: GalleryTitle) -> Path:
     for name in OWN_FILES:
         shutil.copyfile(here / name, folder / name)
     shutil.copytree(here / VIEWER_FOLDER, folder / VIEWER_FOLDER, dirs_exist_ok=True)
-    environment = Environment(
-        loader=PackageLoader("genassets.reporting", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(TEMPLATE).render(
-        title=title, cards=json.dumps(entries, ensure_ascii=True).replace("<", "\\u003c"), count=len(entries)
+    page = fill_page(
+        TEMPLATE,
+        title=title,
+        cards=json.dumps(entries, ensure_ascii=True).replace("<", "\\u003c"),
+        count=len(entries),
     )
     (folder / GALLERY_PAGE).write_text(page, encoding="utf-8")
     return folder / GALLERY_PAGE

@@ -16,6 +16,7 @@ from genassets.pipeline.run_record import METRICS_FILE, SPEC_FILE, RunRecord, St
 from genassets.pipeline.store import CURVES, MANIFEST, PICTURES
 from genassets.reporting.gallery import GALLERY_PAGE, GalleryTitle, write_gallery
 from genassets.reporting.metric_tables import MetricTable, stage_tables
+from genassets.reporting.pages import fill_page
 
 REPORT_FOLDER = "report"
 PAGE = "index.html"
@@ -90,22 +91,14 @@ def write_report(run_dir: Path) -> Path:
     Outputs that are gone from the store are named on the page. Raises OSError or ValueError where run.json
     cannot be read.
     """
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
     record = RunRecord.load(run_dir)
     folder = run_dir / REPORT_FOLDER
     partial = run_dir / f".{REPORT_FOLDER}-partial"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     metrics = read_metrics(run_dir / METRICS_FILE)
-    environment = Environment(
-        loader=PackageLoader("genassets.reporting", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    page = environment.get_template(TEMPLATE).render(
+    page = fill_page(
+        TEMPLATE,
         run=record,
         started=time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(record.started)),
         duration=duration_text((record.finished or time.time()) - record.started),
