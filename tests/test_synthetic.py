@@ -21,7 +21,7 @@ from genassets.driving.synthetic.materials import Kind, glow_table
 from genassets.driving.synthetic.mesh import MeshBuilder, add_box
 from genassets.driving.synthetic.rig import CAMERA_RIG, FORWARD_SPAN, SPINNING_SPAN, spinning_time
 from genassets.driving.synthetic.sweeps import cast_sweep
-from genassets.driving.synthetic.synthesize import lidar_view, make_scene, synthesize_log
+from genassets.driving.synthetic.synthesize import camera_view, lidar_view, make_scene, synthesize_log
 from genassets.driving.synthetic.tracing import Placed, Solid, TracedCity
 from genassets.driving.synthetic.trajectories import ego_drive, parked
 from genassets.driving.synthetic.truth import open_truth, ply_bytes, read_ply
@@ -244,6 +244,20 @@ def test_swapped_vehicles_take_the_paths_of_others_and_change_nothing_else() -> 
         hulls = [cv2.convexHull(c.astype(np.float32)) for c in corners]
         assert cv2.intersectConvexConvex(hulls[0], hulls[1])[0] == 0, (one.instance, another.instance)
     assert [a.actor_id for a in make_scene(swapped, 3).actors] == [a.actor_id for a in other.actors]
+
+
+def test_other_traffic_drives_in_the_same_streets_and_light() -> None:
+    spec = CitySpec(frames=2, vehicles=12, pedestrians=2)
+    scene, other = (make_scene(s, 3) for s in (spec, spec.model_copy(update={"traffic_seed": 8})))
+    assert {a.actor_id for a in scene.actors}.isdisjoint(a.actor_id for a in other.actors)
+    places = [{tuple(a.path.at(0.0)[0].round(3)) for a in s.actors} for s in (scene, other)]
+    assert places[0].isdisjoint(places[1])
+    assert np.array_equal(scene.light.sun_direction, other.light.sun_direction)
+    assert np.array_equal(scene.world_from_city, other.world_from_city)
+    assert scene.start_time == other.start_time
+    empty = [make_scene(s, 3, lambda _: ()) for s in (scene.spec, other.spec)]
+    views = [camera_view(s, "front_camera", 0)[1] for s in empty]
+    assert np.array_equal(*views)
 
 
 def test_every_vehicle_class_is_there() -> None:
