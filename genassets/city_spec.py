@@ -35,6 +35,8 @@ class VehicleSwap(BaseModel):
     seed: Annotated[int, Field(ge=0)]
     share: Annotated[float, Field(gt=0.0, le=1.0)] = 0.5
     """Part of the vehicles that are swapped, for any class as often as a log has it."""
+    shift: Annotated[float, Field(ge=0.0, le=20.0)] = 0.0
+    """Metres by which they go ahead of or behind the ones that they replace, at most."""
 
 
 class CitySpec(BaseModel):

@@ -246,6 +246,22 @@ def test_swapped_vehicles_take_the_paths_of_others_and_change_nothing_else() -> 
     assert [a.actor_id for a in make_scene(swapped, 3).actors] == [a.actor_id for a in other.actors]
 
 
+def test_shifted_vehicles_keep_to_the_lines_of_those_they_replace() -> None:
+    spec = CitySpec(frames=2, vehicles=20, pedestrians=0)
+    shifted = spec.model_copy(update={"swapped": VehicleSwap(seed=5, shift=4.0)})
+    scene, other = make_scene(spec, 3), make_scene(shifted, 3)
+    metres = []
+    for before, after in zip(scene.actors, other.actors, strict=True):
+        (here, heading), (there, same) = (a.path.at([0.0, 1.0]) for a in (before, after))
+        assert np.array_equal(heading, same)
+        along = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+        ahead = np.sum((there - here) * along, axis=-1)
+        assert there == pytest.approx(here + ahead[:, None] * along, abs=1e-9)
+        assert ahead[0] == pytest.approx(ahead[1], abs=1e-9)
+        metres.append(ahead[0])
+    assert np.abs(metres).max() <= 4.0 and np.ptp([m for m in metres if m]) > 2.0
+
+
 def test_other_traffic_drives_in_the_same_streets_and_light() -> None:
     spec = CitySpec(frames=2, vehicles=12, pedestrians=2)
     scene, other = (make_scene(s, 3) for s in (spec, spec.model_copy(update={"traffic_seed": 8})))

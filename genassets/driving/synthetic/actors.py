@@ -160,8 +160,9 @@ def swap_vehicles(
         actor = actors[place]
         for _ in range(SWAP_ATTEMPTS):
             model = draw_model(classes[int(rng.integers(len(classes)))], rng)
-            if crowd.is_free(actor.path, model.size):
-                swapped[place] = replace(actor, actor_id=make_uuid(rng), model=model)
+            path = actor.path.ahead(float(rng.uniform(-swap.shift, swap.shift))) if swap.shift else actor.path
+            if crowd.is_free(path, model.size):
+                swapped[place] = replace(actor, actor_id=make_uuid(rng), model=model, path=path)
                 break
     return tuple(swapped)
 

@@ -5,7 +5,7 @@ A path gives where the middle of a thing's footprint is and where it heads at an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +34,11 @@ class Path:
         x = np.interp(t, self.times, self.positions[:, 0])
         y = np.interp(t, self.times, self.positions[:, 1])
         return np.stack([x, y], axis=-1), np.interp(t, self.times, self.headings)
+
+    def ahead(self, metres: float) -> Path:
+        """The path of a thing so far ahead of this one, if it goes straight on."""
+        direction = np.stack([np.cos(self.headings), np.sin(self.headings)], axis=-1)
+        return replace(self, positions=self.positions + metres * direction)
 
     @property
     def stationary(self) -> bool:
