@@ -15,13 +15,16 @@ from tiny_log import CAR_SIZE, CONE, MOVING, PARKED, WALKER, build_tiny_log
 from genassets.augmentation.assets import Assets
 from genassets.augmentation.bodies import Body
 from genassets.augmentation.collisions import Surroundings, footprint, overlap
-from genassets.augmentation.placement import in_place_of, label_of
+from genassets.augmentation.placement import ahead_of, in_place_of, label_of
 from genassets.augmentation.plan import Plan, plan_variant
+from genassets.augmentation.roadside import Roadside
 from genassets.augmentation.settings import AugmentSettings, CameraName
 from genassets.driving import CAMERA_NAMES, CLASSES, Log, class_of, open_log
 from genassets.driving.log import Track
+from genassets.driving.portable_pickle import make_table, pickle_table
+from genassets.driving.unpickle import read_table
 from genassets.errors import GenAssetsError, SpecError, StageError
-from genassets.geometry.transforms import heading_of, yaw_pose
+from genassets.geometry.transforms import heading_of, transform_points, yaw_pose
 
 BODIES = box_bodies()
 WITH_OWN = assets_of(
@@ -65,6 +68,102 @@ def test_an_asset_stands_on_the_ground_contact_with_the_heading_of_the_actor(log
         assert (stands.label, stands.actor_class) == ("Bus", "Bus")
         assert len(stands.uuids) == len(track.uuids) and not set(stands.uuids) & set(track.uuids)
         assert np.array_equal(stands.frames, track.frames) and np.array_equal(stands.times, track.times)
+
+
+def around_a_circle(radius: float, degrees: float, slope: float = 0.0) -> Track:
+    """A car that drives along an arc in 11 frames, on a road that rises along x."""
+    angle = np.radians(np.linspace(0.0, degrees, 11))
+    places = np.stack([radius * np.sin(angle), radius * (1 - np.cos(angle)), np.zeros(11)], axis=1)
+    places[:, 2] = slope * places[:, 0] + 0.8
+    return Track(
+        "car", "Car", "Car", np.array(CAR), np.arange(11), np.arange(11) / 2.0, yaw_pose(angle, places), False,
+        ("car",), False, None,
+    )  # fmt: skip
+
+
+def test_ahead_is_on_the_path_and_straight_on_beyond_it() -> None:
+    track = around_a_circle(20.0, 90.0, slope=0.03)
+    moved = ahead_of(track, 4.0, np.array([0.03, 0.0]))
+    angle = np.radians(np.linspace(0.0, 90.0, 11)) + 4.0 / 20.0
+    on_path = angle < np.pi / 2
+    circle = np.stack([20 * np.sin(angle), 20 * (1 - np.cos(angle))], axis=1)
+    assert moved.world_from_box[on_path, :2, 3] == pytest.approx(circle[on_path], abs=0.08)  # chords
+    assert heading_of(moved.world_from_box[on_path]) == pytest.approx(angle[on_path], abs=0.01)
+    end = track.world_from_box[-1, :2, 3]
+    beyond = moved.world_from_box[~on_path, :2, 3] - end
+    assert beyond[-1] == pytest.approx([0.0, 4.0], abs=1e-9), "4 m on, as it heads at the end"
+    assert moved.world_from_box[:, 2, 3] == pytest.approx(
+        0.8 + 0.03 * moved.world_from_box[:, 0, 3], abs=1e-9
+    )
+    assert np.array_equal(moved.frames, track.frames) and np.array_equal(moved.times, track.times)
+    back = ahead_of(track, -4.0, np.array([0.03, 0.0]))
+    assert back.world_from_box[0, :3, 3] == pytest.approx([-4.0, 0.0, 0.8 - 0.12], abs=1e-9)
+
+
+def test_what_stands_goes_along_its_heading(log: Log) -> None:
+    track = log.track(PARKED)
+    along = track.world_from_box[:, :2, 0]
+    for metres in (-2.5, 0.0, 2.5):
+        moved = ahead_of(track, metres, np.zeros(2))
+        assert moved.world_from_box[:, :2, 3] == pytest.approx(
+            track.world_from_box[:, :2, 3] + metres * along, abs=1e-9
+        )
+
+
+def test_returns_in_a_box_block_it_save_those_of_the_ground() -> None:
+    track = around_a_circle(20.0, 90.0)
+    pose = track.world_from_box[3]
+
+    def beside(*places: tuple[float, float, float]) -> Roadside:
+        return Roadside(3, np.zeros(2), transform_points(pose, np.array(places)))
+
+    pole = [(1.0, 0.5, z) for z in (-0.2, 0.0, 0.2)]
+    assert beside(*pole).blocks(track)
+    assert not beside(*pole[:2]).blocks(track), "two returns may be noise"
+    assert not beside(*[(x, 0.0, -0.7) for x in (0.0, 0.5, 1.0)]).blocks(track), "ground, or a kerb"
+    assert not beside(*[(2.06, y, 0.0) for y in (0.0, 0.2, 0.4)]).blocks(track), "at its face"
+    elsewhere = replace(beside(*pole), frame=4)
+    assert not elsewhere.blocks(track)
+    assert not replace(elsewhere, frame=40).blocks(track), "a frame without it"
+
+
+def test_assets_stand_ahead_of_and_behind_the_actors_that_they_replace(log: Log) -> None:
+    removed = {t.actor_id: t for t in log.tracks}
+    free = [e.edit for s in range(6) for e in plan(log, seed=s, shift=3.0).edits]
+    metres = []
+    for edit in free:
+        assert edit.removed is not None and edit.placed is not None
+        before, after = removed[edit.removed.actor_id], edit.placed.track
+        assert np.array_equal(after.frames, before.frames)
+        away = after.world_from_box[:, :3, 3] - before.world_from_box[:, :3, 3]
+        along = np.sum(away[:, :2] * before.world_from_box[:, :2, 0], axis=1)
+        assert np.abs(along).max() <= 3.0 + 1e-9
+        assert away[:, :2] == pytest.approx(along[:, None] * before.world_from_box[:, :2, 0], abs=1e-6)
+        assert away[:, 2] == pytest.approx((after.size[2] - before.size[2]) / 2, abs=0.05)
+        metres.append(along[0])
+    assert max(metres) > 1.0 and min(metres) < -1.0
+    assert sum(np.abs(metres) > 1e-9) == sum(
+        plan(log, seed=n, shift=3.0).counts()["assets_shifted"] for n in range(6)
+    )
+    assert plan(log).counts()["assets_shifted"] == 0
+
+
+def test_a_fence_along_the_way_keeps_an_asset_in_place(tmp_path: Path) -> None:
+    log = open_log(build_tiny_log(tmp_path / "tiny", frames=3))
+    path = log.sweep_paths[2]  # in which the ego car is nearest to the parked one
+    assert path is not None
+    table = read_table(path)
+    fence = table.iloc[[0] * 120].assign(x=np.arange(9.0, 21.0, 0.1), y=-4.0, z=1.0)
+    columns = {str(name): np.concatenate([table[name], fence[name]]) for name in table}
+    path.write_bytes(pickle_table(make_table(columns, index_name="index")))
+    fenced = open_log(log.root)
+    for seed in range(6):
+        for edit in (planned.edit for planned in plan(fenced, seed=seed, shift=3.0).edits):
+            assert edit.removed is not None and edit.placed is not None
+            if edit.removed.actor_id == PARKED:
+                away = edit.placed.track.world_from_box[0, :2, 3] - edit.removed.world_from_box[0, :2, 3]
+                # Half of a car's 4.2 m reach no fence that begins 0.3 m beyond the actor's 4.5 m.
+                assert np.linalg.norm(away) < 0.7
 
 
 @pytest.mark.parametrize("actor_class", CLASSES)
@@ -263,6 +362,7 @@ def test_a_turn_into_another_box_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "values",
     [
+        {"shift": -1.0}, {"shift": 21.0}, {"shift": float("inf")},
         {"fraction": 0.0}, {"fraction": 1.5}, {"fraction": float("nan")}, {"variants": 0}, {"policy": "best"},
         {"cameras": ()}, {"classes": ("Plane",)}, {"insert": ({"x": 1.0},)},
         {"insert": ({"x": float("inf"), "y": 0.0},)}, {"insert": ({"x": 1.0, "y": 0.0, "frames": (3, 1)},)},

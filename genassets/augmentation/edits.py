@@ -30,8 +30,8 @@ class PlacedAsset:
 class Edit:
     """One change of a log, the same over all frames.
 
-    removed: the log's own actor that goes. placed: the asset that comes. A swap has both, at the same ground contact;
-    a turned actor is removed and placed with its own asset.
+    removed: the log's own actor that goes. placed: the asset that comes. A swap has both, at the same ground contact or
+    along its path; a turned actor is removed and placed with its own asset.
     """
 
     removed: Track | None

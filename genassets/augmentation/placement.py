@@ -1,4 +1,6 @@
-"""Where a placed asset stands: on the ground contact and with the heading of the actor that it replaces."""
+"""Where a placed asset stands: on the ground contact and with the heading of the actor that it replaces, or along its
+path.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from genassets.driving.classes import class_of
 from genassets.driving.log import Log, Track
-from genassets.geometry.transforms import heading_of, yaw_pose
+from genassets.geometry.transforms import heading_of, interpolate_pose, yaw_pose
 
 Array = NDArray[np.float64]
 
@@ -58,6 +60,27 @@ def in_place_of(track: Track, actor_class: str, size: Array, identity: str, degr
         world_from_box=poses,
         uuids=tuple(new_id(identity, old) for old in track.uuids),
     )
+
+
+def ahead_of(track: Track, metres: float, slope: Array) -> Track:
+    """An actor's track moved along its own path, back where metres are negative.
+
+    Beyond an end of its path, and if it stands, it goes straight on as its box heads. slope (2,): rise of the road
+    there over world x and y.
+    """
+    poses = track.world_from_box
+    steps = np.linalg.norm(np.diff(poses[:, :2, 3], axis=0), axis=1)
+    gone = np.concatenate([[0.0], np.cumsum(steps)])
+    wanted = gone + metres
+    on_path = np.clip(wanted, 0.0, gone[-1])
+    moved = np.stack(
+        [interpolate_pose(track.times, poses, time) for time in np.interp(on_path, gone, track.times)]
+    )
+    along = moved[:, :2, 0] / np.linalg.norm(moved[:, :2, 0], axis=1, keepdims=True)
+    beyond = (wanted - on_path)[:, None] * along
+    moved[:, :2, 3] += beyond
+    moved[:, 2, 3] += beyond @ slope
+    return replace(track, world_from_box=moved)
 
 
 def standing_at(

@@ -16,7 +16,8 @@ from genassets.augmentation.bodies import Bodies, Body
 from genassets.augmentation.collisions import Surroundings
 from genassets.augmentation.edits import Edit, PlacedAsset
 from genassets.augmentation.ground import ground_around
-from genassets.augmentation.placement import in_place_of, standing_at
+from genassets.augmentation.placement import ahead_of, in_place_of, standing_at
+from genassets.augmentation.roadside import Roadside, roadside
 from genassets.augmentation.settings import AugmentSettings, Insertion, Rotation
 from genassets.driving.classes import CLASSES, VEHICLE_CLASSES
 from genassets.driving.log import Log, Track
@@ -54,12 +55,22 @@ class Plan:
     def counts(self) -> dict[str, int]:
         """What was planned, in numbers of actors and assets."""
         origins = [planned.origin for planned in self.edits]
+        swaps = [planned.edit for planned in self.edits if planned.origin == "swapped"]
         return {
             **{f"actors_{origin}": origins.count(origin) for origin in get_args(Origin)},
             "actors_eligible": self.eligible,
             **{f"actors_left_alone_{reason.replace(' ', '_')}": n for reason, n in self.left_alone.items()},
             "assets_retried": self.retried,
+            "assets_shifted": sum(map(_stands_elsewhere, swaps)),
         }
+
+
+@dataclass(frozen=True)
+class _Way:
+    """A path for an asset in an actor's place. beside: what else stands there, where it is not the actor's own."""
+
+    track: Track
+    beside: Roadside | None
 
 
 def plan_variant(
@@ -148,22 +159,59 @@ def _swaps(
         if not rows:
             left_alone["no asset"] += 1
             continue
-        for row in [rows[i] for i in own.permutation(len(rows))[:TRIES]]:
-            body = _body(bodies, row)
-            if body is not None:
-                size = track.size if settings.size == "fitted" else body.size
-                placed = in_place_of(
-                    track, assets.actor_class(row), size, f"{identity}/{'/'.join(assets.identity(row))}"
-                )
-                if not surroundings.blocks(placed, without=track.actor_id):
-                    surroundings.remove(track.actor_id)
-                    surroundings.add(placed)
-                    edits.append(PlannedEdit(Edit(track, PlacedAsset(row, placed, body.bounds)), "swapped"))
-                    break
+        rows = [rows[i] for i in own.permutation(len(rows))[:TRIES]]
+        ways = _ways(log, track, settings.shift, own)
+        for row in rows:
+            placed = _placed(row, track, ways, assets, bodies, settings, surroundings, identity)
+            if placed is not None:
+                surroundings.remove(track.actor_id)
+                surroundings.add(placed.track)
+                edits.append(PlannedEdit(Edit(track, placed), "swapped"))
+                break
             retried += 1
         else:
             left_alone["no asset fits"] += 1
     return edits, len(eligible), dict(left_alone), retried
+
+
+def _ways(log: Log, track: Track, shift: float, rng: np.random.Generator) -> list[_Way]:
+    """The paths to be tried for assets in an actor's place: the one ahead of or behind it first, then its own."""
+    own = _Way(track, None)
+    beside = roadside(log, track) if shift else None
+    if beside is None:
+        return [own]
+    return [_Way(ahead_of(track, float(rng.uniform(-shift, shift)), beside.slope), beside), own]
+
+
+def _placed(
+    row: int,
+    track: Track,
+    ways: Sequence[_Way],
+    assets: Assets,
+    bodies: Bodies,
+    settings: AugmentSettings,
+    surroundings: Surroundings,
+    identity: str,
+) -> PlacedAsset | None:
+    """An asset in an actor's place, on the first way that is free; None where none is, or the asset has no surface."""
+    body = _body(bodies, row)
+    if body is None:
+        return None
+    size = track.size if settings.size == "fitted" else body.size
+    new = f"{identity}/{'/'.join(assets.identity(row))}"
+    for way in ways:
+        placed = in_place_of(way.track, assets.actor_class(row), size, new)
+        met = way.beside is not None and way.beside.blocks(placed)
+        if not met and not surroundings.blocks(placed, without=track.actor_id):
+            return PlacedAsset(row, placed, body.bounds)
+    return None
+
+
+def _stands_elsewhere(swap: Edit) -> bool:
+    """Whether an asset is not where the actor was that it replaces, seen from above."""
+    assert swap.removed is not None and swap.placed is not None
+    here, there = (track.world_from_box[:, :2, 3] for track in (swap.removed, swap.placed.track))
+    return not np.allclose(here, there)
 
 
 def _classes(actor_class: str, policy: str) -> tuple[str, ...]:

@@ -90,6 +90,12 @@ class AugmentSettings(_Settings):
         default="own",
         description="An asset keeps its size, or is stretched to that of the actor it replaces.",
     )
+    shift: float = Field(
+        default=0.0,
+        ge=0,
+        le=20,
+        description="Metres along its path that an asset may stand ahead of or behind the actor it replaces.",
+    )
     time_of_day: Literal["same", "any"] = Field(
         default="same",
         description="Only assets of day logs in day logs, of night logs in night logs; or any.",

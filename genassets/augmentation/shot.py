@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Num
 from numpy.typing import NDArray
 
 from genassets.driving import Log, Track
@@ -111,7 +112,7 @@ def region_of(bounds: tuple[float, float, float, float], intrinsics: Intrinsics,
 
 
 def in_bounds(
-    pixels: Float[Array, "pixels 2"], bounds: tuple[float, float, float, float]
+    pixels: Num[NDArray[Any], "pixels 2"], bounds: tuple[float, float, float, float]
 ) -> Bool[NDArray[np.bool_], " pixels"]:
     """Which pixels have x0 <= x < x1 and y0 <= y < y1."""
     # Column by column: numpy reduces over two columns far slower.
