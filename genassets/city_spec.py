@@ -58,8 +58,6 @@ class CitySpec(BaseModel):
     moving_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.35
     """Part of the vehicles that drive; the rest is parked along the kerbs."""
     pedestrians: Annotated[int, Field(ge=0, le=60)] = 8
-    traffic_seed: Annotated[int, Field(ge=0)] | None = None
-    """Draws who is there and where they go, in the same streets and light; None leaves it to the log's seed."""
     swapped: VehicleSwap | None = None
     """None leaves the vehicles that the seed draws."""
     classes: tuple[ActorClass, ...] = ALL_CLASSES

@@ -119,8 +119,6 @@ def make_scene(
     """The scene of a spec and a seed. recast: who is there instead of those that were drawn."""
     streams = np.random.SeedSequence(seed).spawn(4)
     city_rng, crowd_rng, light_rng, rng = (np.random.default_rng(stream) for stream in streams)
-    if spec.traffic_seed is not None:
-        crowd_rng = np.random.default_rng(spec.traffic_seed)
     ego, layout = ego_drive(spec)
     ego_car = ego_model()
     city = build_city(layout, city_rng)
